@@ -40,10 +40,11 @@ def test_figures_are_printed_and_the_folder_last(given, capsys, tmp_path) -> Non
     _, run = given
     truth = {"source": "fox", "cameras": 9}
     truth |= {name: {"median": 0.25, "mean": 1.0, "max": 2.5} for name in ("rotation_degrees", "translation_per_cent")}
-    assert run(QUALITY | {"truth": truth}) == main.DONE
+    assert run(QUALITY | {"truth": truth, "masked": 7}) == main.DONE
     text = capsys.readouterr().out
     for expected in (
         "9 of 10",
+        "7 photographs have one",
         "1234",
         "4.2",
         "0.51 px",

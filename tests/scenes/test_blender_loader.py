@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,17 @@ def test_dots_are_where_the_cameras_say(folder: Path) -> None:
     assert scene.bounds.hi.tolist() == [1.5, 1.5, 1.5]
     assert torch.equal(scene.world_from_local, torch.eye(4))
     assert scene.train[2].name == "train/r_2"
+
+
+def test_pictures_that_only_a_monitor_looks_at_may_be_absent(folder: Path) -> None:
+    """As in copies of the data set that are cut down to what is fitted and scored."""
+    shutil.rmtree(folder / "val")
+    scene = validate(Blender().load(folder, SceneOptions()))
+    assert [len(scene.train), len(scene.val), len(scene.test)] == [4, 0, 4]
+    assert scene.notes["missing_val"] == "none of the 6 listed files exists"
+    shutil.rmtree(folder / "test")
+    with pytest.raises(InputError, match="None of the 4 pictures"):
+        Blender().load(folder, SceneOptions())
 
 
 def test_dots_are_found_after_resizing(folder: Path) -> None:

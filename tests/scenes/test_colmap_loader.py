@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from dots import COLOURS, POINTS, Eye, assert_dots_are_found, ring, save
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from invgraphics.errors import InputError
@@ -155,6 +156,34 @@ def test_largest_of_several_models_is_taken(tmp_path: Path, given: str) -> None:
         assert scene.notes["model"] == (
             "sparse/1 (9 photographs) has the most photographs; not taken: sparse/0 (3 photographs)"
         )
+
+
+def reduced(root: Path, width: int, height: int) -> None:
+    """Copies of the photographs at another size, beside them."""
+    (root / "images_4").mkdir()
+    for photo in (root / "images").iterdir():
+        Image.open(photo).resize((width, height), Image.Resampling.BOX).save(root / "images_4" / photo.name)
+
+
+@pytest.mark.parametrize("given", [".", "images", "images_4"])
+def test_the_folder_of_photographs_that_is_named_is_taken(tmp_path: Path, given: str) -> None:
+    root = mixed(tmp_path / "garden")
+    reduced(root, 80, 60)
+    scene = validate(find_loader(root / given).load(root / given, SceneOptions()))
+    assert scene.name == "garden" and len(scene.train) + len(scene.test) == 9
+    assert scene.train[0].camera.width == (80 if given == "images_4" else 160)
+    assert_dots_are_found(scene)
+
+
+def test_another_model_is_not_given_the_named_photographs(tmp_path: Path) -> None:
+    """An undistorted model has its own; of the models that have the named ones, that with most of them is taken."""
+    root = workspace(tmp_path)
+    write(root, ring(9)[:4], ["PINHOLE 160 120 150 155 83 58"] * 4)  # fewer than the undistorted model has
+    scene = Colmap().load(root / "images", SceneOptions())
+    assert len(scene.train) + len(scene.test) == 4
+    taken, left = scene.notes["model"].split("; not taken: ")
+    assert taken.endswith("sparse/0 (4 photographs) has those that were asked for") and "dense/0/sparse (9" in left
+    assert len(Colmap().load(root, SceneOptions()).train) == 7
 
 
 @pytest.mark.parametrize("place", ["images", "sparse/0/images", "input", "sparse/images", "."])

@@ -1,8 +1,11 @@
 """Reading, resizing and undistorting photographs."""
 
+import io
 import json
+import struct
 import subprocess
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +16,7 @@ from PIL import Image, ImageOps
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
-from invgraphics.scenes.pictures.images import Photo, image_files, image_size, match_sizes, read_pixels
+from invgraphics.scenes.pictures.images import Photo, image_files, image_size, match_sizes, read_pixels, stored_size
 from invgraphics.scenes.pictures.lens import Lens, straighten, undistort
 from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 from invgraphics.scenes.pictures.views import load_view
@@ -94,12 +97,13 @@ def test_exif_orientation_is_applied_unless_the_camera_contradicts(tmp_path: Pat
     assert image_size(path, like=(200, 300)) == (2, 3)
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_calibrated_pixels_are_taken_as_stored(tmp_path: Path, orientation: int) -> None:
+def test_calibrated_pixels_are_taken_as_stored(tmp_path: Path, orientation: int, suffix: str) -> None:
     """As COLMAP reads them, whatever EXIF says; without a camera they are upright, as Pillow turns them."""
     import pycolmap
 
-    rng, path = np.random.default_rng(0), tmp_path / "a.png"
+    rng, path = np.random.default_rng(0), tmp_path / f"a.{suffix}"
     for size in ((6, 6), (8, 6)):
         picture = Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8))
         exif = picture.getexif()
@@ -108,6 +112,86 @@ def test_calibrated_pixels_are_taken_as_stored(tmp_path: Path, orientation: int)
         assert image_size(path, like=size) == size
         np.testing.assert_array_equal(read_pixels(path, like=size), pycolmap.Bitmap.read(str(path), True).to_array())
         np.testing.assert_array_equal(read_pixels(path), np.asarray(ImageOps.exif_transpose(Image.open(path))))
+
+
+WRONG_TAGS = {
+    "no other tag": [],
+    "XResolution as text": [(0x011A, 2, 4, b"72\0\0")],
+    "ImageWidth negative": [(0x0100, 9, 1, struct.pack("<l", -1))],
+    "ImageHeight as a signed short": [(0x0101, 8, 1, struct.pack("<hh", -5, 0))],
+    "BitsPerSample as a signed byte": [(0x0102, 6, 1, b"\xff\0\0\0")],
+    "an EXIF folder as text": [(0x8769, 2, 4, b"abc\0")],
+    "an EXIF folder beyond the end": [(0x8769, 4, 1, struct.pack("<L", 99999))],
+    "GPS that points to itself": [(0x8825, 4, 1, struct.pack("<L", 8))],
+    "an unknown type": [(0x9999, 99, 1, bytes(4))],
+    "a count beyond the end": [(0x9999, 3, 0x7FFFFFFF, bytes(4))],
+}
+
+
+def jpeg_with_tags(picture: np.ndarray, tags: list[tuple[int, int, int, bytes]]) -> bytes:
+    """A JPEG file with an EXIF segment of these entries: tag, type, count, value."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, "JPEG", quality=95)
+    plain = stream.getvalue()
+    entries = b"".join(struct.pack("<HHL", tag, kind, count) + value for tag, kind, count, value in tags)
+    exif = b"Exif\0\0II*\0" + struct.pack("<LH", 8, len(tags)) + entries + bytes(4)
+    return plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:]
+
+
+@pytest.mark.parametrize("tags", WRONG_TAGS.values(), ids=WRONG_TAGS)
+def test_tags_of_wrong_types_do_not_keep_a_photograph_from_being_turned(tmp_path: Path, tags: list) -> None:
+    """Of all EXIF only the orientation counts."""
+    picture = np.zeros((16, 32, 3), np.uint8)
+    picture[:8, :16] = 255  # the upper left quarter
+    turn = (0x0112, 3, 1, struct.pack("<HH", 6, 0))  # by 90 degrees clockwise: the upper right one
+    (tmp_path / "a.jpg").write_bytes(jpeg_with_tags(picture, [turn, *tags]))
+    assert image_size(tmp_path / "a.jpg") == (16, 32)
+    expected = np.rot90(picture, -1).astype(int)
+    assert np.abs(read_pixels(tmp_path / "a.jpg").astype(int) - expected).max() < 8
+
+
+def test_an_orientation_that_is_no_number_is_none(tmp_path: Path) -> None:
+    picture = np.zeros((16, 32, 3), np.uint8)
+    (tmp_path / "a.jpg").write_bytes(jpeg_with_tags(picture, [(0x0112, 2, 4, b"6\0\0\0")]))
+    assert image_size(tmp_path / "a.jpg") == (32, 16)
+    assert read_pixels(tmp_path / "a.jpg").shape == (16, 32, 3)
+
+
+@pytest.mark.parametrize("error", [TypeError, KeyError, OverflowError, struct.error])
+def test_whatever_pillow_raises_about_tags_is_a_sentence(tmp_path: Path, monkeypatch, error: type[Exception]) -> None:
+    def fail(image):
+        raise error("wrong tag")
+
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    monkeypatch.setattr(Image.Image, "getexif", fail)
+    monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.getexif", fail)
+    for read in (read_pixels, image_size):
+        with pytest.raises(InputError, match=r"a\.png is damaged \(4x4\): '?wrong tag"):
+            read(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+@pytest.mark.parametrize("suffix", ["tif", "jpg", "png", "webp"])
+def test_every_format_is_turned_once(tmp_path: Path, suffix: str, orientation: int) -> None:
+    """The upper left quarter is white as stored; sizes and pixels agree with each other, upright and stored."""
+    stored = np.zeros((16, 32, 3), np.uint8)
+    stored[:8, :16] = 255
+    quarters = {1: 0, 3: 2, 6: -1, 8: 1}[orientation]  # anticlockwise, as numpy turns
+    upright = np.rot90(stored, quarters)
+    path, exif = tmp_path / f"a.{suffix}", Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(stored).save(path, exif=exif, **{"webp": {"lossless": True}, "jpg": {"quality": 95}}.get(suffix, {}))
+
+    def same(pixels: np.ndarray, expected: np.ndarray) -> bool:
+        return pixels.shape == expected.shape and np.abs(pixels.astype(int) - expected).max() < 8
+
+    assert stored_size(path) == image_size(path, like=(64, 32)) == (32, 16)
+    assert image_size(path) == upright.shape[1::-1]
+    assert same(read_pixels(path), upright)
+    assert same(read_pixels(path, like=(64, 32)), stored), "the camera has the stored shape"
+    turned = orientation in (6, 8)
+    assert image_size(path, like=(32, 64)) == ((16, 32) if turned else (32, 16))
+    assert same(read_pixels(path, like=(32, 64)), upright if turned else stored)
 
 
 def test_truncated_png_is_named(tmp_path: Path) -> None:
@@ -123,6 +207,21 @@ def test_truncated_png_is_named(tmp_path: Path) -> None:
         read_pixels(path)
     with pytest.raises(InputError, match=r"gone\.png does not exist"):
         read_pixels(tmp_path / "gone.png")
+
+
+def test_a_picture_of_too_many_pixels_is_no_damaged_file(tmp_path: Path) -> None:
+    """A phone's 200 megapixels, of which the header is enough."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 16320, 12240, 8, 2, 0, 0, 0))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", b"x") + chunk(b"IEND", b""))
+    for read in (read_pixels, image_size):
+        with pytest.raises(
+            InputError, match=r"a\.png has 200 million pixels; no more than 179 million are read\.\nMake it smaller"
+        ):
+            read(tmp_path / "a.png")
 
 
 def test_shadow_files_of_macos_are_no_photographs(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -14,8 +15,8 @@ from dots import ring, save
 from scipy.spatial.transform import Rotation
 
 from invgraphics.scenes.open import SceneOptions, open_scene
-from invgraphics.scenes.photos import PhotoJob, reconstruct
-from invgraphics.scenes.photos.attempts import choice, try_strategies
+from invgraphics.scenes.photos import PhotoJob, attempts, reconstruct, sfm
+from invgraphics.scenes.photos.attempts import choice, try_all_pairs, try_strategies
 from invgraphics.scenes.photos.mapping import Matched
 from invgraphics.scenes.photos.outlier_cameras import isolation, remove_outlier_cameras
 from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
@@ -112,6 +113,133 @@ def test_the_best_of_the_suspicious_is_kept(truth, tmp_path: Path) -> None:
     assert best.consistency["suspicious"]
 
 
+def bent(truth: pycolmap.Reconstruction, cameras: tuple[int, ...] = (2,)) -> pycolmap.Reconstruction:
+    """A copy in which some cameras have a lens that nothing straightens."""
+    copy = pycolmap.Reconstruction(truth)
+    for number in cameras:
+        focal, x, y, _ = copy.cameras[number].params
+        copy.cameras[number].params = [focal, x, y, -1.0]
+    return copy
+
+
+@pytest.fixture
+def two_cameras() -> pycolmap.Reconstruction:
+    """Five photographs by each of two cameras."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 1, COUNT // 2, 80
+    model = pycolmap.synthesize_dataset(options)
+    for number, image in model.images.items():
+        image.name = f"{number}.png"
+    return model
+
+
+def test_poses_whose_lenses_can_be_removed_are_better(two_cameras, tmp_path: Path) -> None:
+    """Even where they explain fewer of the matches: of the others not all photographs can be written."""
+    best, rows, _ = tried(two_cameras, [bent(two_cameras), turned(two_cameras, 2)], tmp_path)
+    assert rows[0]["support"] > rows[1]["support"] + 0.2 and rows[0]["suspicious"] and rows[1]["suspicious"]
+    assert [row["kept"] for row in rows].index(True) == 1
+    assert (best.registered, best.outliers) == (COUNT, {})
+
+
+def test_photographs_whose_lens_cannot_be_removed_are_left_out(two_cameras, tmp_path: Path) -> None:
+    best, rows, _ = tried(two_cameras, [bent(two_cameras)], tmp_path)
+    placed = {image.camera_id for image in best.pieces[0].images.values() if image.has_pose}
+    assert (placed, best.registered, rows[0]["registered"]) == ({1}, COUNT // 2, COUNT // 2)
+    gone = {f"{number}.jpg" for number, image in two_cameras.images.items() if image.camera_id == 2}
+    assert set(best.outliers) == gone and rows[0]["outlier_cameras"] == len(gone)
+    assert all(why.startswith("no straight picture can be made of it: The distort") for why in best.outliers.values())
+    assert not best.consistency["implausible"], "judged anew, without them"
+
+
+def test_without_any_lens_that_can_be_removed_nothing_is_placed(two_cameras, tmp_path: Path) -> None:
+    best, rows, _ = tried(two_cameras, [bent(two_cameras, (1, 2))], tmp_path)
+    assert (best.registered, best.pieces, best.consistency, len(best.outliers)) == (0, [], None, COUNT)
+    assert rows[0]["outcome"] == "nothing placed"
+
+
+def without(model: pycolmap.Reconstruction, left_out: int) -> pycolmap.Reconstruction:
+    """A copy in which some photographs are not placed."""
+    copy = pycolmap.Reconstruction(model)
+    for number in sorted(copy.images)[:left_out]:
+        copy.deregister_frame(copy.images[number].frame_id)
+    return copy
+
+
+def test_a_sound_half_is_not_the_end(truth, tmp_path: Path) -> None:
+    """The strategy that places most photographs is kept, though others explain as many of the matches of theirs."""
+    best, rows, used = tried(truth, [without(truth, 4), without(truth, 2), truth], tmp_path)
+    assert len(used) == 3 and best.registered == COUNT
+    best, rows, used = tried(truth, [without(truth, 5), without(truth, 2), without(truth, 3)], tmp_path)
+    assert len(used) == 6 and [row["kept"] for row in rows].index(True) == 1
+    best, rows, used = tried(truth, [without(truth, 1)], tmp_path)
+    assert (best.registered, len(used)) == (COUNT - 1, 1), "nine in ten are enough"
+
+
+def test_more_photographs_are_worth_more_than_a_better_explanation() -> None:
+    """Of sound attempts; of suspicious ones, whose photographs may stand anywhere, the explanation counts."""
+
+    def attempt(registered: int, support: float, suspicious: bool) -> attempts.Attempt:
+        model = SimpleNamespace(num_reg_images=lambda: registered)
+        return attempts.Attempt(Strategy("global", "radial"), [model], {}, {"suspicious": suspicious, "support": support}, 1.0)
+
+    order = [(60, 0.8, True), (40, 0.9, True), (31, 0.7, False), (50, 0.6, False), (50, 0.65, False)]
+    ranks = [attempt(*each).rank(60) for each in order]
+    assert ranks == sorted(ranks) and len(set(ranks)) == len(ranks)
+
+
+def test_suspicious_poses_of_all_do_not_beat_sound_ones_of_half(truth, tmp_path: Path) -> None:
+    best, _, _ = tried(truth, [turned(truth, 4), without(truth, 5)], tmp_path)
+    assert best.registered == 5 and not best.consistency["suspicious"]
+    best, _, _ = tried(truth, [turned(truth, 4), without(truth, 7)], tmp_path)
+    assert best.registered == COUNT, "three of ten are no scene"
+
+
+def test_photographs_that_show_nothing_are_not_waited_for(truth, tmp_path: Path, monkeypatch) -> None:
+    """Two of ten are blurred: what places the other eight is the end."""
+    evidence = evidence_of(truth)
+    monkeypatch.setitem(globals(), "evidence_of", lambda _: replace(evidence, features=(5, 5, *evidence.features[2:])))
+    assert len(tried(truth, [without(truth, 2)], tmp_path)[2]) == 1
+
+
+@pytest.mark.parametrize(("matching", "features"), [("auto", 1000), ("sequential", 1000), ("auto", 50)])
+def test_all_pairs_are_matched_where_neighbours_place_few(
+    truth, tmp_path: Path, monkeypatch, matching: str, features: int
+) -> None:
+    """Once, and only where the choice was ours and photographs show something."""
+    full = evidence_of(truth)
+    near = [pair for pair in full.pairs if pair.second == pair.first + 1]
+    few = VerifiedMatches((features,) * COUNT, tuple(near))
+    monkeypatch.setattr(sfm, "EXHAUSTIVE", COUNT - 1)
+    wanted, done = [], []
+    monkeypatch.setattr(attempts, "match", lambda pairs, *_: wanted.extend(pairs))
+    monkeypatch.setattr(attempts, "read_verified_matches", lambda *_: full)
+
+    def place(strategy, matched, progress):
+        return [truth if matched.evidence is full else without(truth, 7)]
+
+    def show(step: int, total: int, _: str) -> None:
+        done.append(step / total)
+
+    matched = Matched(PhotoJob(str(tmp_path), matching=matching), photos_of(truth), few, tmp_path)
+    after, best, rows = try_all_pairs(matched, *try_strategies(matched, show, place), show, place)
+    assert done == sorted(done) and done[-1] < 1
+    if (matching, features) != ("auto", 1000):
+        assert (wanted, best.registered, after) == ([], 3, matched)
+        return
+    assert wanted == list(combinations(range(COUNT), 2))
+    assert best.registered == COUNT and after.evidence is full
+    assert [row["kept"] for row in rows] == [False] * (len(rows) - 1) + [True]
+    assert choice(rows).startswith("incremental mapper, radial lens, all pairs matched: 10 placed")
+
+
+@pytest.mark.parametrize("mapper", ["auto", "incremental", "global"])
+def test_every_lens_is_tried_by_the_mappers_that_may(mapper: str) -> None:
+    """As `--help` says of `--lens auto` and `--mapper auto`."""
+    rows = strategies(PhotoJob("p", mapper=mapper), [Prepared("a.png", "a", 10, 10, "")])
+    assert {row.lens for row in rows} == {"radial", "pinhole", "opencv"}
+    assert {row.mapper for row in rows} == ({"incremental", "global"} if mapper == "auto" else {mapper})
+
+
 def test_settings_restrict_what_is_tried() -> None:
     photos = [Prepared("a.png", "a", 10, 10, "")]
     anything = strategies(PhotoJob("p"), photos)
@@ -170,9 +298,10 @@ def test_a_scene_repeats_the_inconsistency_of_its_import(key: str, suspicious: b
     assert "poses" not in open_scene(str(tmp_path), SceneOptions()).notes
     quality = {"key": "k", "choice": "global mapper", key: {"suspicious": suspicious, "sentence": "3 of 9 contradict"}}
     (tmp_path / "quality.json").write_text(json.dumps(quality))
-    notes = open_scene(str(tmp_path), SceneOptions()).notes
-    assert notes["poses"] == "global mapper"
-    assert notes.get("inconsistent_poses") == ("3 of 9 contradict" if suspicious else None)
+    for spelled in (".", "sparse", "sparse/0", "images"):  # any of the scene's folders names it
+        notes = open_scene(str(tmp_path / spelled), SceneOptions()).notes
+        assert notes.get("poses") == "global mapper", spelled
+        assert notes.get("inconsistent_poses") == ("3 of 9 contradict" if suspicious else None)
 
 
 @pytest.mark.slow

@@ -201,6 +201,31 @@ def test_a_mixed_bag_keeps_what_can_be_used(box_photos: Path, tmp_path: Path) ->
     assert len(validated.train) + len(validated.test) == 9
 
 
+@pytest.mark.usefixtures("in_process")
+def test_masks_beside_the_photographs_come_with_the_scene(box_photos: Path, tmp_path: Path) -> None:
+    """Nothing is matched where they are dark, and what the scene's views show there does not count."""
+    shutil.copytree(box_photos, tmp_path / "images")
+    mask = np.full((SIZE, SIZE), 255, np.uint8)
+    mask[: SIZE // 3] = 0
+    for name in ("000.png", "004.png"):
+        save(mask, tmp_path / "masks" / name)
+    quality = reconstruct(PhotoJob(str(tmp_path / "images"), lens="pinhole"), tmp_path / "scene")
+    assert (quality["registered"], quality["masked"]) == (10, 2)
+    scene = open_scene(str(tmp_path / "scene"), SceneOptions(test_views=None))
+    assert scene.notes["masks"].startswith("2 of 10")
+    for view in (*scene.train, *scene.test):
+        if view.name in ("000.png", "004.png"):
+            np.testing.assert_array_equal(view.mask.numpy(), mask == 255)
+        else:
+            assert view.mask is None
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(tmp_path / "scene/sparse/0"))
+    for image in model.images.values():
+        if image.name in ("000.png", "004.png"):
+            assert image.num_points3D and min(point.xy[1] for point in image.points2D) > SIZE // 3 - 2
+
+
 def _save_16_bits(pixels: np.ndarray, path: Path) -> None:
     """An RGB PNG of 16 bits per channel, which Pillow cannot write."""
     import struct

@@ -1,6 +1,8 @@
 """The stages of an import on their own: working copies, pairs, lens removal, and the process that does the work."""
 
 import json
+import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,9 +19,10 @@ from PIL import Image
 from invgraphics.errors import InputError
 from invgraphics.scenes.photos import PhotoJob
 from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
-from invgraphics.scenes.photos.prepare import Preparation, natural, prepare
+from invgraphics.scenes.photos.prepare import Preparation, prepare
 from invgraphics.scenes.photos.result import _move_points, max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
+from invgraphics.scenes.photos.sources import natural
 from invgraphics.scenes.pictures.lens import Lens, straighten
 from invgraphics.scenes.process import run_worker
 
@@ -105,11 +108,57 @@ def test_the_pictures_of_a_data_set_are_taken_as_fits_see_them(tmp_path: Path) -
         np.testing.assert_array_equal(copy, noise(index, 96, 80))
 
 
+def test_the_pictures_of_a_data_set_are_reduced_while_they_are_read(tmp_path: Path, monkeypatch) -> None:
+    """None is kept at its full size; the copies and their cameras are as if each had been reduced by itself."""
+    from invgraphics.scenes.nerfstudio import Nerfstudio
+
+    table = {"fl_x": 180.0, "cx": 100.0, "cy": 84.0, "w": 192, "h": 160, "camera_model": "PINHOLE", "frames": []}
+    for index in range(9):
+        save(noise(index, 192, 160), tmp_path / f"set/images/{index}.png")
+        pose = np.eye(4)
+        pose[0, 3] = index
+        table["frames"].append({"file_path": f"images/{index}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "set/transforms.json").write_text(json.dumps(table))
+    load, scenes = Nerfstudio.load, []
+    monkeypatch.setattr(Nerfstudio, "load", lambda *arguments: scenes.append(load(*arguments)) or scenes[-1])
+    photos = prepared(tmp_path / "set", tmp_path, max_size=96).photos
+    assert {view.image.shape for view in (*scenes[0].train, *scenes[0].test)} == {(80, 96, 3)}
+    assert {(photo.width, photo.height, photo.focal, photo.centre) for photo in photos} == {(96, 80, 90.0, (50.0, 42.0))}
+    for index in range(9):
+        copy = np.array(Image.open(tmp_path / f"work/photos/{index}.png"))
+        assert np.abs(copy - noise(index, 192, 160).reshape(80, 2, 96, 2, 3).mean((1, 3))).max() <= 0.51
+
+
 def test_names_are_told_apart(tmp_path: Path) -> None:
     for index, name in enumerate(["my photo.png", "my photo.jpg", "other.png"]):
         save(noise(index, 64, 64), tmp_path / "photos" / name)
     names = [photo.name for photo in prepared(tmp_path / "photos", tmp_path).photos]
     assert names == ["my_photo.jpg.png", "my_photo.png.png", "other.png.png"]
+
+
+def test_names_that_no_text_file_takes(tmp_path: Path) -> None:
+    """Not UTF-8, a comment of COLMAP's list of pairs, a digit that is no number, letters that become the same."""
+    (tmp_path / "photos").mkdir()
+    for index, name in enumerate((b"foto_\xe9_1.png", b"foto_\xe8_1.png", b"#3.png", "1²3.png".encode(), b"a\nb.png")):
+        save(noise(index, 64, 64), tmp_path / "a.png")
+        (tmp_path / "a.png").rename(tmp_path / "photos" / os.fsdecode(name))
+    photos = prepared(tmp_path / "photos", tmp_path).photos
+    assert all(re.fullmatch(r"[A-Za-z0-9_.-]+\.png", photo.name) for photo in photos)
+    assert len({photo.name for photo in photos}) == len({photo.source for photo in photos}) == 5
+    "".join(photo.source for photo in photos).encode()
+    assert any("foto_\\udce9_1" in photo.source for photo in photos)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_progress_is_reported_in_any_encoding(encoding: str) -> None:
+    """A name is no reason to end the work."""
+    script = "from invgraphics.scenes.process import write_progress; write_progress(1, 2, 'foto \\udce9\\n \u0444')"
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.decode(encoding) == (
+        "progress 1 2 foto ? \u0444\n" if encoding == "utf-8" else "progress 1 2 foto ? ?\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -138,6 +187,7 @@ def test_one_camera_cannot_have_two_sizes(tmp_path: Path) -> None:
 
 def test_numbers_in_names_count_as_numbers() -> None:
     assert sorted(["b10", "B9", "a2b11", "a2b3"], key=natural) == ["a2b3", "a2b11", "B9", "b10"]
+    assert sorted(["1²3", "1²10", "٣"], key=natural) == ["1²3", "1²10", "٣"], "raised to a power is no number, any script's is"
 
 
 def test_pairs() -> None:
@@ -168,6 +218,78 @@ def test_masks_and_calibrations_of_a_data_set_are_kept(tmp_path: Path) -> None:
     for index, photo in enumerate(photos):
         left_out = np.array(Image.open(tmp_path / f"work/masks/{photo.name}.png")) == 0
         assert left_out.sum() == 80 * 10 * (index % 2) and not left_out[:, 10 * (index % 2) :].any()
+
+
+@pytest.mark.parametrize("place", ["masks", "photos/masks"])
+def test_masks_beside_photographs_are_used(place: str, tmp_path: Path) -> None:
+    """By COLMAP's names or the photographs' own, at another size, in part, and of photographs that EXIF turns."""
+    folder, exif = tmp_path / "photos", Image.Exif()
+    exif[0x0112] = 6
+    for index in range(5):
+        save(noise(index, 192, 128), folder / f"{index}.png")
+    for index in (3, 4):
+        Image.fromarray(noise(index, 192, 128)).save(folder / f"{index}.png", exif=exif)
+    left = np.full((128, 192), 255, np.uint8)
+    left[:, :48] = 0
+    save(left, tmp_path / place / "0.png.png")
+    save(left[::2, ::2], tmp_path / place / "1.png")
+    save(left, tmp_path / place / "3.png")  # drawn on the photograph as it is stored
+    save(np.rot90(left, -1), tmp_path / place / "4.png")  # drawn on it as it is shown
+    photos = prepared(folder, tmp_path, max_size=96).photos
+    assert [photo.own_mask for photo in photos] == [True, True, False, True, True]
+    for photo, turns in zip(photos, (0, 0, None, -1, -1), strict=True):
+        expected = np.full((64, 96), 255, np.uint8) if turns is None else np.rot90(left[::2, ::2], turns)
+        np.testing.assert_array_equal(np.array(Image.open(tmp_path / f"work/masks/{photo.name}.png")), expected)
+        if turns is not None:
+            np.testing.assert_array_equal(np.array(Image.open(tmp_path / f"work/own-masks/{photo.name}.png")), expected)
+    key = PhotoJob(str(folder)).key()
+    (tmp_path / place / "other.png").write_bytes(b"of no photograph")
+    assert PhotoJob(str(folder)).key() == key
+    save(left.T, tmp_path / place / "4.png")
+    assert PhotoJob(str(folder)).key() != key
+
+
+def test_a_mask_that_cannot_be_used_leaves_its_photograph_out(tmp_path: Path) -> None:
+    for index in range(5):
+        save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
+    save(np.zeros((64, 64), np.uint8), tmp_path / "masks/0.png")
+    save(np.full((64, 32), 255, np.uint8), tmp_path / "masks/1.png")
+    save(np.eye(64, dtype=np.uint8) * 255, tmp_path / "masks/2.png")
+    preparation = prepared(tmp_path / "photos", tmp_path, max_size=64)
+    assert set(preparation.skipped) == {"0.png", "1.png"}
+    assert "is black" in preparation.skipped["0.png"] and "has 32x64 pixels" in preparation.skipped["1.png"]
+    work = tmp_path / "again"
+    work.mkdir()
+    job = PhotoJob(str(tmp_path / "photos"), max_size=64)
+    save(np.eye(640, dtype=np.uint8) * 255, tmp_path / "masks/2.png")
+    save(noise(2, 640, 640), tmp_path / "photos/2.png")
+    assert prepare(job, work, quiet).skipped["2.png"] == "Its mask leaves no pixel"
+
+
+def test_masks_are_straightened_with_their_pictures(tmp_path: Path) -> None:
+    """A dark disc in the picture is masked: in the straight picture, too, the mask covers it, and little more."""
+    import pycolmap
+
+    grid = np.hypot(*np.meshgrid(np.arange(160) - 30.0, np.arange(120) - 30.0))
+    picture, mask = np.where(grid < 12, 0, 255).astype(np.uint8), np.where(grid < 13, 0, 255).astype(np.uint8)
+    model = pycolmap.Reconstruction()
+    params = [150.0, 80.0, 60.0, -0.2]
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=120, params=params, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    for number in (1, 2):
+        changed = picture.copy()
+        changed[-1, -number] = 7  # no two may be the same
+        save(np.repeat(changed[..., None], 3, axis=2), tmp_path / f"photos/{number}.png")
+        save(mask, tmp_path / f"masks/{number}.png")
+        image = pycolmap.Image(f"{number}.png", [], 1, number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), [number, 0, 0]])))
+    photos = prepared(tmp_path / "photos", tmp_path).photos
+    assert write_scene(model, photos, tmp_path / "work", tmp_path / "result", quiet) > 3
+    for number in (1, 2):
+        dark = np.array(Image.open(tmp_path / f"result/images/{number}.png"))[:100, :100, 0] < 250
+        left_out = np.array(Image.open(tmp_path / f"result/masks/{number}.png.png"))[:100, :100] == 0
+        assert dark.sum() > 300 and (left_out | ~dark).all()
+        assert left_out.sum() < 1.6 * dark.sum()
 
 
 def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None:
@@ -202,6 +324,28 @@ def test_a_lens_is_removed_from_pictures_and_model_alike(tmp_path: Path) -> None
     assert max(errors) < 0.02
     assert Image.open(tmp_path / "result/images/0.png").size == (160, 120)
     assert [path.name for path in (tmp_path / "result/masks").iterdir()] == ["0.png.png"]
+
+
+def test_the_lens_of_a_removed_photograph_does_not_matter(tmp_path: Path) -> None:
+    """The last of five cameras has a lens that nothing straightens, and no photograph in the scene."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for number in range(1, 6):
+        save(noise(number, 160, 106), tmp_path / f"photos/{number}.png")
+        params = [120.0, 80.0, 53.0, -1.0] if number == 5 else [190.0, 80.0, 53.0, 0.01]
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=106, params=params, camera_id=number)
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(f"{number}.png", [], number, number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), [number, 0, 0]])))
+    photos = prepared(tmp_path / "photos", tmp_path).photos
+    model.deregister_frame(model.images[5].frame_id)
+    moved = write_scene(model, photos, tmp_path / "work", tmp_path / "result", quiet)
+    assert 0 < moved < 1, "of the pictures that are written"
+    assert len(list((tmp_path / "result/images").iterdir())) == 4
+    written = pycolmap.Reconstruction(str(tmp_path / "result/sparse/0"))
+    assert written.num_reg_images() == 4
+    assert {camera.model_name for camera in written.cameras.values()} == {"PINHOLE"}
 
 
 def test_features_without_a_ray_are_outside_the_straight_picture() -> None:
@@ -282,6 +426,62 @@ def _script(folder: Path, body: str) -> str:
     path.write_text(f"#!/bin/sh\n{body}\n")
     path.chmod(0o755)
     return str(path)
+
+
+def test_a_request_is_known_by_what_is_read(tmp_path: Path, monkeypatch) -> None:
+    """However its folder is spelled, whatever else lies there; of photographs, size and date count."""
+    folder = tmp_path / "photos"
+    for index in range(3):
+        save(noise(index, 64, 64), folder / f"{index}.png")
+    job = PhotoJob(str(folder))
+    keys = [job.key(), job.matches_key()]
+    monkeypatch.chdir(tmp_path)
+    for spelled in ("photos", "./photos/", "photos/../photos"):
+        assert [PhotoJob(spelled).key(), PhotoJob(spelled).matches_key()] == keys
+    for name in (".DS_Store", "._0.png", "Thumbs.db", "notes.txt", ".hidden.jpg", "below/0.png"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"anything")
+        assert [job.key(), job.matches_key()] == keys, name
+    assert len(prepared(folder, tmp_path).photos) == 3
+    (folder / "3.dng").write_bytes(b"told as left out")
+    assert job.key() != keys[0]
+    (folder / "3.dng").unlink()
+    save(noise(9, 64, 64), folder / "0.png")
+    assert job.key() != keys[0] and job.matches_key() != keys[1]
+
+
+def test_the_files_of_a_data_set_count_but_for_hidden_ones(tmp_path: Path) -> None:
+    save(noise(0, 64, 64), tmp_path / "images/0.png")
+    (tmp_path / "transforms.json").write_text("{}")
+    key = PhotoJob(str(tmp_path)).key()
+    for name in (".DS_Store", "images/.DS_Store", "images/Thumbs.db", ".git/index"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"anything")
+        assert PhotoJob(str(tmp_path)).key() == key, name
+    (tmp_path / "transforms.json").write_text('{"w": 1}')
+    assert PhotoJob(str(tmp_path)).key() != key
+
+
+def test_an_import_is_gone_on_with_from_another_folder(tmp_path: Path, monkeypatch) -> None:
+    """Working copies that a command with a relative path has left are used by one with an absolute path."""
+    for index in range(3):
+        save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
+
+    def interrupted(*args, **kwargs):
+        (tmp_path / "out" / WORK / "left").write_text("something")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", interrupted)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(PhotoJob("photos"), Path("out"))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    left = tmp_path / "out" / WORK / "left"
+    left.write_text("not written again")
+    monkeypatch.setattr(subprocess, "Popen", lambda *args, **kwargs: pytest.fail(left.read_text()))
+    with pytest.raises(pytest.fail.Exception, match="not written again"):
+        reconstruct(PhotoJob(str(tmp_path / "photos")), tmp_path / "out")
 
 
 def test_an_interrupted_import_is_gone_on_with(tmp_path: Path, monkeypatch) -> None:

@@ -1,6 +1,7 @@
 """``transforms.json`` of nerfstudio and instant-ngp, distorted lenses included."""
 
 import json
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from dots import GL, POINTS, Eye, assert_dots_are_found, composited, ring, save
+from dots import COLOURS, GL, POINTS, Eye, assert_dots_are_found, composited, ring, save
 from PIL import Image
 
 from invgraphics.errors import InputError
@@ -84,6 +85,84 @@ def test_dots_are_where_the_cameras_say(tmp_path: Path, distortion, top: dict) -
     scene = validate(Nerfstudio().load(tmp_path, SceneOptions()))
     assert_dots_are_found(scene)
     assert ("undistortion" in scene.notes) == (distortion is not None)
+
+
+@pytest.mark.parametrize("model", [None, "OPENCV", "RADIAL"])
+def test_a_fourth_radial_term_is_not_taken_for_a_denominator(tmp_path: Path, model: str | None) -> None:
+    """Nerfstudio's polynomial, 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸, is no model of COLMAP's."""
+    named = {} if model is None else {"camera_model": model}
+    write(tmp_path, ring(9), {"k1": 0.05, "k4": -0.05, **named})
+    with pytest.raises(InputError, match=r"frame 0 .* has a 'k4' that is not 0, .* (OPENCV|RADIAL) .*\n.*FULL_OPENCV"):
+        Nerfstudio().load(tmp_path, SceneOptions())
+    edit(tmp_path, lambda table: table.update(k4=0.0, k6=0.1))
+    with pytest.raises(InputError, match="'k6' that is not 0"):
+        Nerfstudio().load(tmp_path, SceneOptions())
+    edit(tmp_path, lambda table: table.update(k6=0.0))
+    assert Nerfstudio().load(tmp_path, SceneOptions()).notes["undistortion"].startswith("OPENCV removed")
+
+
+def point_file(kind: str) -> bytes:
+    """The dots as nerfstudio writes them (text), or with doubles and normals between the columns (binary)."""
+    if kind == "ascii":
+        head = "ply\nformat ascii 1.0\nelement vertex 6\n"
+        head += "".join(f"property float {name}\n" for name in "xyz")
+        head += "".join(f"property uint8 {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
+        rows = [
+            f"{x:.8f} {y:.8f} {z:.8f} {r:.0f} {g:.0f} {b:.0f}"
+            for (x, y, z), (r, g, b) in zip(POINTS, 255 * COLOURS, strict=True)
+        ]
+        return (head + "\n".join(rows) + "\n").encode()
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[kind]
+    head = f"ply\nformat {kind} 1.0\ncomment written by hand\nelement vertex 7\n"
+    head += "".join(f"property double {name}\n" for name in "xyz") + "property float nx\n"
+    head += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    head += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [
+        struct.pack(f"{order}dddfBBB", *point, 0.5, *np.rint(255 * c).astype(int))
+        for point, c in zip(POINTS, COLOURS, strict=True)
+    ]
+    return head.encode() + b"".join(rows) + struct.pack(f"{order}dddfBBB", np.nan, 0, 0, 0, 1, 2, 3)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_points_beside_the_poses_are_kept(tmp_path: Path, kind: str) -> None:
+    """They are in the frame of the poses, whatever transform both have been through; one that is not finite is left out."""
+    write(tmp_path, ring(9), {"ply_file_path": "sparse_pc.ply", "applied_transform": np.eye(4)[[1, 0, 2]].tolist()})
+    (tmp_path / "sparse_pc.ply").write_bytes(point_file(kind))
+    scene = validate(Nerfstudio().load(tmp_path, SceneOptions()))
+    assert scene.points is not None
+    world = scene.points.position @ scene.world_from_local[:3, :3].T + scene.world_from_local[:3, 3]
+    np.testing.assert_allclose(world.numpy(), POINTS, atol=1e-5)
+    np.testing.assert_allclose(scene.points.rgb.numpy(), COLOURS, atol=0.003)
+    assert scene.notes["points"] == "6 from sparse_pc.ply"
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"plain text", "is no PLY file: its header has no beginning"),
+        (b"ply\nformat ascii 1.0\n", "is no PLY file: its header has no end"),
+        (point_file("ascii")[:-60], "is cut off: it has 4 of 6 vertices"),
+        (point_file("binary_little_endian")[:-40], "is cut off: it has 5 of 7 vertices"),
+        (point_file("ascii").replace(b"vertex 6", b"vertex 999999999999999999"), "is cut off: it has 6 of 9"),
+        (point_file("ascii").replace(b"0.8", b"abc"), "vertex that is no numbers"),
+        (point_file("ascii").replace(b"float z", b"float w"), "is no PLY file of points"),
+        (point_file("ascii").replace(b"property float z", b"property list uchar int z"), "cannot be read"),
+    ],
+)
+def test_bad_points_are_a_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
+    write(tmp_path, ring(9), {"ply_file_path": "sparse_pc.ply"})
+    (tmp_path / "sparse_pc.ply").write_bytes(content)
+    with pytest.raises(InputError, match=rf"sparse_pc\.ply.* {sentence}"):
+        Nerfstudio().load(tmp_path, SceneOptions())
+
+
+def test_absent_points_are_noted(tmp_path: Path) -> None:
+    scene = Nerfstudio().load(write(tmp_path, ring(9), {"ply_file_path": "./sparse_pc.ply"}), SceneOptions())
+    assert (scene.points, scene.notes["points"]) == (None, "./sparse_pc.ply is absent")
+    edit(tmp_path, lambda table: table.update(ply_file_path=3))
+    with pytest.raises(InputError, match=r"'ply_file_path' of .* is 3, not the path"):
+        Nerfstudio().load(tmp_path, SceneOptions())
 
 
 def test_distortion_matters(tmp_path: Path) -> None:
@@ -174,13 +253,15 @@ def test_scaled_copies_of_the_photographs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("orientation", [3, 6])
 @pytest.mark.parametrize("sized", [True, False])
-def test_exif_turns_no_calibrated_photograph(tmp_path: Path, orientation: int, sized: bool) -> None:
-    write(tmp_path, ring(9), {})
-    for path in (tmp_path / "images").iterdir():
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_exif_turns_no_calibrated_photograph(tmp_path: Path, orientation: int, sized: bool, suffix: str) -> None:
+    write(tmp_path, ring(9), {}, suffix="")
+    for path in sorted((tmp_path / "images").iterdir()):
         picture = Image.open(path)
         exif = picture.getexif()
         exif[0x0112] = orientation
-        picture.save(path, exif=exif)
+        path.unlink()
+        picture.save(path.with_suffix(suffix), exif=exif)
     edit(tmp_path, lambda table: None if sized else (table.pop("w"), table.pop("h")))
     assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
 

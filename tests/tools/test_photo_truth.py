@@ -58,6 +58,23 @@ def test_errors_are_those_of_the_poses_by_name(data_set) -> None:
     assert truth["scale"] == pytest.approx(5, rel=1e-4)
 
 
+def test_poses_are_compared_without_the_pictures_in_memory(data_set, monkeypatch) -> None:
+    """Of each picture a thousandth of the pixels is kept; poses are those of the full size."""
+    from PIL import Image
+
+    from invgraphics.scenes.nerfstudio import Nerfstudio
+
+    folder, poses = data_set
+    for path in (folder / "images").iterdir():
+        Image.new("RGB", (1024, 1024)).save(path)
+    load, scenes = Nerfstudio.load, []
+    monkeypatch.setattr(Nerfstudio, "load", lambda *arguments: scenes.append(load(*arguments)) or scenes[-1])
+    truth = compare(folder / "images", report(poses, [f"{index:04}.png" for index in range(9)]), folder)
+    kept = sum(view.image.numel() for view in (*scenes[0].train, *scenes[0].test))
+    assert kept < 9 * 1024 * 1024 * 3 / 1000
+    assert (truth["cameras"], truth["rotation_degrees"]["max"]) == (9, pytest.approx(10, abs=1e-3))
+
+
 def test_strangers_are_refused(data_set) -> None:
     folder, poses = data_set
     with pytest.raises(InputError, match="has poses of 0 of the 9"):

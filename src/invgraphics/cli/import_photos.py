@@ -21,23 +21,25 @@ class ImportPhotos:
     """Reconstruct camera poses and points from photographs (structure from motion), and write them as a scene.
 
     The folder of the scene gets straight pictures, poses and points in COLMAP's format, quality.json, and a plot of cameras and
-    points. Where a check finds the poses suspicious, other strategies are tried and the best result is kept. An interrupted
-    import continues when the same command is given again; another mapper or lens finds the features and matches of the last one
-    in FOLDER/.import, which may be deleted.
+    points. Where a check finds the poses suspicious, or a tenth of the photographs that match others is not placed, other
+    strategies are tried and the best result is kept. An interrupted import continues when the same command is given again;
+    another mapper or lens finds the features and matches of the last one in FOLDER/.import, which may be deleted.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
-    """A folder of photographs; or a data set, whose pictures are taken without its poses."""
+    """A folder of photographs, with masks of their names in `masks/` in it or beside it if there are any (dark pixels do not
+    count); or a data set, whose pictures are taken without its poses."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: scenes/DIR)")] = None
     """Folder of the scene, new or empty."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which pairs are compared: all of them, or each photograph with those near it in name order; auto: all, up to 200
-    photographs."""
+    photographs, or up to 500 where less than half of them could be placed."""
     mapper: Literal["auto", "incremental", "global"] = "auto"
     """How poses are found: one photograph after the other, or all at once (GLOMAP); auto: the first, and the other where the
-    result is suspicious."""
+    result is suspicious or leaves photographs out."""
     lens: Literal["auto", "pinhole", "radial", "opencv", "fisheye"] = "auto"
-    """What distortion is estimated and removed; auto: radial, and pinhole or opencv where the result is suspicious."""
+    """What distortion is estimated and removed; auto: radial, and pinhole and opencv where the result is suspicious or
+    leaves photographs out."""
     single_camera: bool = False
     """All photographs share one set of intrinsics (default: those of one size and one EXIF lens do)."""
     camera_per_photo: bool = False
@@ -99,6 +101,8 @@ def show_quality(quality: Mapping[str, Any]) -> None:
 def _rows(quality: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     pieces = "".join(f", a separate piece of {count}" for count in quality["other_pieces"])
     yield "photographs placed", f"{quality['registered']} of {quality['used']}{pieces}"
+    if quality.get("masked"):
+        yield "masks", f"{quality['masked']} photographs have one: dark pixels do not count"
     if quality["registered"]:
         yield "points", f"{quality['points']}, each in {quality['track_length']:.1f} photographs"
         yield "reprojection error", f"{quality['reprojection_error_px']:.2f} px"

@@ -7,7 +7,7 @@ from pathlib import Path
 from invgraphics.core import Scene
 from invgraphics.scenes.frames import Frames
 from invgraphics.scenes.layout import SceneOptions, Split, compose, evenly, existing_photos
-from invgraphics.scenes.pictures.images import Photo
+from invgraphics.scenes.pictures.images import Photo, file_exists
 from invgraphics.scenes.region import BOX_HALF, photo_frame
 
 _VAL_VIEWS = 4  # monitored during a fit, never scored
@@ -25,7 +25,7 @@ class Blender:
         return (path / "transforms_train.json").is_file()
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Load the three splits as a scene, photographs read and resized by ``options``.
+        """Load the three splits as a scene, photographs read and resized by ``options``; of ``val`` what there is.
 
         Raises:
             InputError: a file is missing or unusable.
@@ -38,6 +38,10 @@ class Blender:
 
     def _photos(self, path: Path, split: str, notes: dict[str, str]) -> list[Photo]:
         source = path / f"transforms_{split}.json"
-        photos, missing = existing_photos(Frames.read(source).photos(), source)
+        listed = Frames.read(source).photos()
+        if split == "val" and not any(file_exists(photo.path) for photo in listed):  # nothing is fitted to them, nor scored
+            notes["missing_val"] = f"none of the {len(listed)} listed files exists"
+            return []
+        photos, missing = existing_photos(listed, source)
         notes |= {f"{key}_{split}": value for key, value in missing.items()}
         return photos

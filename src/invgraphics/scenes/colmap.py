@@ -14,7 +14,7 @@ from invgraphics.core import Camera, Points, Scene
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import colmap_to_opencv
 from invgraphics.errors import InputError
-from invgraphics.scenes.colmap_workspace import Model, find_model, model_folders
+from invgraphics.scenes.colmap_workspace import Model, find_model, model_folders, parents_in_workspace
 from invgraphics.scenes.layout import SceneOptions, compose, every_eighth, existing_photos, scene_name
 from invgraphics.scenes.photos.exposures import exposure_spread
 from invgraphics.scenes.photos.notes import pose_notes
@@ -50,7 +50,7 @@ class Colmap:
         notes |= {
             "loader": "colmap",
             "points": f"{model.reconstruction.num_points3D()} from SfM on all photographs, those that are scored too",
-        } | pose_notes(path)
+        } | pose_notes(parents_in_workspace(model.folder))
         notes |= {"model": model.note} if model.note else {}
         frame = photo_frame(photos, _points(model.reconstruction))
         return _with_tracks(compose(scene_name(path), every_eighth(photos), frame, options, notes), model)

@@ -55,6 +55,8 @@ def model_folders(path: Path) -> list[Path]:
 def find_model(path: Path) -> Model:
     """Select the model with the most photographs on disk; of equal ones the first in the order of `PLACES`.
 
+    If ``path`` is a folder of photographs (``images_4``), those in it are taken, and a model of theirs.
+
     Raises:
         InputError: there is no model, none can be read, none registers an image, or no photograph of any exists.
     """
@@ -63,15 +65,17 @@ def find_model(path: Path) -> Model:
         raise InputError(
             f"{path} has no COLMAP model.", f"Looked for cameras.bin or cameras.txt in {', '.join((*PLACES, *UNDISTORTED))}."
         )
+    given = path.resolve()
     models, failures = [], []
     for folder in folders:
         try:
-            models.append(_read(folder))
+            models.append(_read(folder, given))
         except InputError as error:
             failures.append((folder, error))
     if not models:
         raise failures[0][1]
-    chosen = max(models, key=lambda model: (model.present, len(model.registered)))  # of equal ones, the first
+    # Of equal ones, the first.
+    chosen = max(models, key=lambda model: (_is_given(model, given), model.present, len(model.registered)))
     if not chosen.registered:
         raise InputError(f"{chosen.folder} registers no image.")
     if chosen.images is None:
@@ -82,7 +86,8 @@ def find_model(path: Path) -> Model:
         )
     others = [f"{_place(model.folder, path)} ({_count(model)})" for model in models if model is not chosen]
     others += [f"{_place(folder, path)} (cannot be read)" for folder, _ in failures]
-    note = f"{_place(chosen.folder, path)} ({_count(chosen)}) has the most photographs; not taken: {', '.join(others)}"
+    why = "has those that were asked for" if _is_given(chosen, given) else "has the most photographs"
+    note = f"{_place(chosen.folder, path)} ({_count(chosen)}) {why}; not taken: {', '.join(others)}"
     return replace(chosen, note=note if others else "")
 
 
@@ -100,7 +105,12 @@ def _holds_model(folder: Path) -> bool:
     return any((folder / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))
 
 
-def _read(folder: Path) -> Model:
+def _is_given(model: Model, given: Path) -> bool:
+    """Whether a model's photographs are those that were asked for by their folder."""
+    return model.images is not None and is_image_folder(given) and model.images.resolve() == given
+
+
+def _read(folder: Path, given: Path) -> Model:
     from invgraphics.scenes.colmap_library import pycolmap
 
     check_sizes(folder)
@@ -115,7 +125,8 @@ def _read(folder: Path) -> Model:
     except UnicodeDecodeError as error:
         raise InputError(f"The COLMAP model {folder} has an image whose name is no text in UTF-8.", "Rename it.") from error
     candidates = [replace(bare, images=images, present=_present(images, names)) for images in _image_folders(folder)]
-    fullest = max(candidates, key=lambda model: model.present, default=bare)  # of equal ones, the nearest
+    asked = [model for model in candidates if model.present and _is_given(model, given)]
+    fullest = max(asked or candidates, key=lambda model: model.present, default=bare)  # of equal ones, the nearest
     return fullest if fullest.present else bare
 
 
@@ -123,19 +134,25 @@ def _present(folder: Path, names: Sequence[str]) -> int:
     return sum(file_exists(folder / name) for name in names) if folder.is_dir() else 0
 
 
-def _image_folders(model: Path) -> Iterator[Path]:
-    """List folders that may hold a model's photographs, nearest first: below it, or beside it and its parents.
-
-    The search ends at the folder that holds ``sparse``: photographs farther up are not those of an undistorted model.
-    """
+def parents_in_workspace(model: Path) -> list[Path]:
+    """A model's folder, and those above it up to the one that holds ``sparse`` or ``colmap/sparse``."""
     base = model.resolve()
     bases = [base]
     for convention in (str.isdecimal, "sparse".__eq__, "colmap".__eq__):
         if convention(base.name):
             base = base.parent
             bases.append(base)
+    return bases
+
+
+def _image_folders(model: Path) -> Iterator[Path]:
+    """List folders that may hold a model's photographs, nearest first: below it, or beside it and its parents.
+
+    The search ends at the folder that holds ``sparse``: photographs farther up are not those of an undistorted model.
+    """
+    bases = parents_in_workspace(model)
     for each in bases:
         yield from (each / name for name in IMAGE_FOLDERS)
         yield each
     if len(bases) == 1:  # a model in a folder of any name: photographs beside it
-        yield base.parent / IMAGE_FOLDERS[0]
+        yield bases[0].parent / IMAGE_FOLDERS[0]

@@ -153,7 +153,11 @@ class Frames:
         return self.table.get(key) if own is None else own
 
     def _lens(self, index: int, pinhole: tuple[float, ...], size: tuple[int, int]) -> Lens | None:
-        """Lens of OPENCV (k1 k2 p1 p2; rational with k3 to k6) or OPENCV_FISHEYE (k1 k2 k3 k4); ``None`` for a pinhole."""
+        """Lens of OPENCV (k1 k2 p1 p2 k3), FULL_OPENCV (k4 k5 k6 too) or OPENCV_FISHEYE (k1 to k4); ``None`` for a pinhole.
+
+        What nerfstudio and Metashape call k4 of an OPENCV lens is a fourth term of its polynomial, which no model here has;
+        FULL_OPENCV's k4 is the first of its denominator.
+        """
         k1, k2, p1, p2, *more = (self._number(index, key) or 0.0 for key in _COEFFICIENTS)
         model = str(self._given(index, "camera_model") or "OPENCV")
         fisheye = model == "OPENCV_FISHEYE" or self._given(index, "is_fisheye") is True
@@ -164,6 +168,12 @@ class Frames:
         elif model in ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV"):
             if not any((k1, k2, p1, p2, *more)):  # known without pycolmap, whose import takes as long as many a scene
                 return None
+            if model != "FULL_OPENCV" and any(more[1:]):
+                named = next(key for key, value in zip(("k4", "k5", "k6"), more[1:], strict=True) if value)
+                raise InputError(
+                    f"{self._where(index)} has a '{named}' that is not 0, which the camera model {model} does not have here.",
+                    "Calibrate with k1 to k3; or name FULL_OPENCV, if k4 to k6 are the denominator of OpenCV's rational model.",
+                )
             kind, rational = ("FULL_OPENCV", more) if any(more) else ("OPENCV", [])
             lens = Lens(kind, (*pinhole, k1, k2, p1, p2, *rational), *size)
         else:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from invgraphics.core import Scene
+from invgraphics.core import Points, Scene
 from invgraphics.errors import InputError
 from invgraphics.scenes.frames import Frames, photo_name
 from invgraphics.scenes.layout import SceneOptions, Split, compose, every_eighth, existing_photos, scene_name
-from invgraphics.scenes.pictures.images import Photo
+from invgraphics.scenes.pictures.images import Photo, file_exists
+from invgraphics.scenes.ply_points import read_points
 from invgraphics.scenes.region import photo_frame
 
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")
@@ -19,8 +20,8 @@ class Nerfstudio:
     """Loader of ``transforms.json``: OpenGL axes, OPENCV lenses; endless space, or an object in a box (see `object_frame`).
 
     Photographs are split as the file's ``train_filenames``, ``val_filenames`` and ``test_filenames`` say; without these, every
-    eighth is scored. Poses are taken as they are: an ``applied_transform`` has already been applied to them. Listed
-    photographs that do not exist are skipped and named in the scene's notes.
+    eighth is scored. Poses are taken as they are: an ``applied_transform`` has already been applied to them, and to the points
+    of a ``ply_file_path``. Listed photographs that do not exist are skipped and named in the scene's notes.
     """
 
     def matches(self, path: Path) -> bool:
@@ -28,7 +29,7 @@ class Nerfstudio:
         return _source(path).is_file()
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """Load cameras, lenses and photographs.
+        """Load cameras, lenses, photographs and known points.
 
         Raises:
             InputError: a file is missing or unusable.
@@ -38,10 +39,23 @@ class Nerfstudio:
         listed = frames.photos()
         photos, notes = existing_photos(listed, source)
         notes["loader"] = "nerfstudio"
-        if "ply_file_path" in frames.table:
-            notes["points"] = f"{frames.table['ply_file_path']} is not read"
+        points, said = _known_points(frames)
         split = _own_split(frames, listed, photos) or every_eighth(photos)
-        return compose(scene_name(source.parent), split, photo_frame(photos), options, notes)
+        return compose(scene_name(source.parent), split, photo_frame(photos, points), options, notes | said)
+
+
+def _known_points(frames: Frames) -> tuple[Points | None, dict[str, str]]:
+    """Points of the file's ``ply_file_path``, in the frame of its poses, and a note on them."""
+    given = frames.table.get("ply_file_path")
+    if given is None:
+        return None, {}
+    if not isinstance(given, str) or not given.strip("./\\") or "\0" in given:
+        raise InputError(f"'ply_file_path' of {frames.path} is {given!r}, not the path of a file.")
+    path = frames.path.parent / given.replace("\\", "/")
+    if not file_exists(path):
+        return None, {"points": f"{given} is absent"}
+    points = read_points(path)
+    return points, {"points": f"{0 if points is None else len(points)} from {given}"}
 
 
 def _own_split(frames: Frames, listed: Sequence[Photo], photos: Sequence[Photo]) -> Split | None:

@@ -23,9 +23,11 @@ Progress = Callable[[int, int, str], None]
 
 
 def write_progress(done: int, total: int, what: str) -> None:
-    """Write a worker's progress as a line of standard output."""
+    """Write a worker's progress as a line of standard output, with ? for what its encoding does not have."""
+    encoding = sys.stdout.encoding or "utf-8"
+    line = " ".join(what.split()).encode(encoding, "replace").decode(encoding)
     # A parent that was killed leaves a closed pipe: writing to it ends this process too.
-    print(f"progress {done} {total} {what}", flush=True)
+    print(f"progress {done} {total} {line}", flush=True)
 
 
 def write_error(error: InputError) -> None:
@@ -78,7 +80,7 @@ def run_worker(
     kept = () if lock is None else (lock,)
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
         process = subprocess.Popen(
-            command, stdin=PIPE, stdout=PIPE, stderr=complaints, text=True, env=environment, pass_fds=kept
+            command, stdin=PIPE, stdout=PIPE, stderr=complaints, text=True, errors="replace", env=environment, pass_fds=kept
         )
         try:
             failure = _follow(process, progress)

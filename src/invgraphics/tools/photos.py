@@ -22,6 +22,7 @@ from invgraphics.scenes.photos.maker import writing
 from invgraphics.scenes.process import Progress
 
 _LEAST = 3  # cameras: with two, a similarity explains everything
+_SMALL = 32  # longest side in pixels of pictures whose poses alone count: at full size, hundreds of them fill the memory
 
 
 def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress: Progress | None = None) -> dict[str, Any]:
@@ -67,7 +68,7 @@ def compare(folder: Path, quality: dict[str, Any], truth: Path) -> dict[str, Any
     Raises:
         InputError: the data set cannot be read, or has fewer than three of the photographs.
     """
-    known = true_poses(find_loader(truth).load(truth, SceneOptions(test_views=None)))
+    known = true_poses(find_loader(truth).load(truth, SceneOptions(size=_SMALL, test_views=None)))
     estimated, true = [], []
     for camera in quality["cameras"]:
         pose = _lookup(known, folder, camera["source"])

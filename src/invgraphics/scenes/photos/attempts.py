@@ -1,18 +1,26 @@
-"""Reconstruction by one strategy after another until the checks pass; the best is kept, and each gets a row in the report."""
+"""Reconstruction by one strategy after another until one is sound; the best is kept, and each gets a row in the report."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from invgraphics.scenes.photos.consistency import check_consistency
+from invgraphics.scenes.photos.job import DATABASE
 from invgraphics.scenes.photos.mapping import Matched, reconstruct
-from invgraphics.scenes.photos.outlier_cameras import remove_outlier_cameras
-from invgraphics.scenes.photos.quality import is_usable, registration_obstacle
+from invgraphics.scenes.photos.outlier_cameras import bent_cameras, remove_bent_cameras, remove_outlier_cameras
+from invgraphics.scenes.photos.pairs import read_verified_matches
+from invgraphics.scenes.photos.quality import FEW_FEATURES, is_usable, placeable, registration_obstacle
+from invgraphics.scenes.photos.sfm import Verification, match, may_match_all, pairs
 from invgraphics.scenes.photos.strategies import Strategy, strategies
 from invgraphics.scenes.process import Progress
+
+NEARLY_ALL = 0.9
+"""Share of the photographs that can be placed with which a strategy is the last that is tried."""
 
 Reconstruct = Callable[[Strategy, Matched, Progress], list[Any]]
 
@@ -27,6 +35,7 @@ class Attempt:
         outliers: photograph -> why its camera was removed from the largest piece.
         consistency: see `invgraphics.scenes.photos.consistency.check_consistency`; ``None`` where nothing was placed.
         seconds: that it took.
+        straight: whether all lenses of the largest piece can be removed.
     """
 
     strategy: Strategy
@@ -34,19 +43,36 @@ class Attempt:
     outliers: dict[str, str]
     consistency: dict[str, Any] | None
     seconds: float
+    straight: bool = True
 
     @property
     def registered(self) -> int:
         """Photographs in the largest piece."""
         return self.pieces[0].num_reg_images() if self.pieces else 0
 
-    def passes(self, count: int) -> bool:
-        """Whether enough of ``count`` photographs are placed and nothing is suspicious."""
-        return self.consistency is not None and not self.consistency["suspicious"] and is_usable(self.registered, count)
+    def is_sound(self, count: int) -> bool:
+        """Whether a usable share of ``count`` photographs is placed, their lenses can be removed, and nothing is suspicious."""
+        trusted = self.consistency is not None and not self.consistency["suspicious"]
+        return trusted and self.straight and is_usable(self.registered, count)
 
-    def rank(self, count: int) -> tuple[bool, float]:
-        """Sorting key, best last: whether it passes, then the share of all verified matches that the poses explain."""
-        return self.passes(count), self.consistency["support"] if self.consistency is not None else -1.0
+    def rank(self, count: int) -> tuple[bool, bool, int, float]:
+        """Sorting key, best last: whether it is sound, whether all lenses can be removed, then how many photographs are placed
+        and the share of all verified matches that the poses explain; of unsound ones that share alone."""
+        if self.consistency is None:
+            return False, False, 0, -1.0
+        sound = self.is_sound(count)
+        return sound, self.straight, self.registered if sound else 0, self.consistency["support"]
+
+    def straightened(self, matched: Matched) -> Attempt:
+        """The attempt without the photographs whose lenses cannot be removed; of less than a pair nothing is left."""
+        if self.straight:
+            return self
+        removed = remove_bent_cameras(self.pieces[0], matched.photos)
+        outliers = self.outliers | removed
+        if self.registered < 2:
+            return replace(self, pieces=[], outliers=outliers, consistency=None, straight=True)
+        consistency = check_consistency(self.pieces[0], matched.photos, matched.evidence)
+        return replace(self, outliers=outliers, consistency=consistency, straight=True)
 
     def row(self, kept: bool) -> dict[str, Any]:
         """Its figures for the report."""
@@ -75,7 +101,7 @@ class Attempt:
 def try_strategies(
     matched: Matched, progress: Progress, place: Reconstruct = reconstruct
 ) -> tuple[Attempt, list[dict[str, Any]]]:
-    """Reconstruct by one strategy after another until the checks pass.
+    """Reconstruct by one strategy after another until one is sound and places nearly all photographs that can be placed.
 
     Args:
         matched: features and matches.
@@ -85,25 +111,60 @@ def try_strategies(
     Returns:
         The best attempt, and the report's rows of all of them in their order.
     """
-    count = len(matched.photos)
+    count, enough = len(matched.photos), NEARLY_ALL * placeable(matched.evidence)
     attempts: list[Attempt] = []
     for strategy in strategies(matched.job, matched.photos):
         attempts.append(_attempt(strategy, matched, _attempt_progress(progress, len(attempts)), place))
-        if attempts[-1].passes(count) or registration_obstacle(matched.photos, matched.evidence) is not None:
+        done = attempts[-1].is_sound(count) and attempts[-1].registered >= enough
+        if done or registration_obstacle(matched.photos, matched.evidence) is not None:
             break
     best = max(attempts, key=lambda attempt: attempt.rank(count))
-    return best, [attempt.row(attempt is best) for attempt in attempts]
+    kept = best.straightened(matched)
+    return kept, [kept.row(True) if attempt is best else attempt.row(False) for attempt in attempts]
+
+
+def try_all_pairs(
+    matched: Matched, best: Attempt, rows: list[dict[str, Any]], progress: Progress, place: Reconstruct = reconstruct
+) -> tuple[Matched, Attempt, list[dict[str, Any]]]:
+    """Where each photograph was matched with its neighbours only and few could be placed: match all pairs, and try again.
+
+    Photographs of no order share little with those of the next names.
+
+    Args:
+        matched: features and matches.
+        best: the best attempt so far.
+        rows: the report's rows so far.
+        progress: as for `try_strategies`, of which it goes on.
+        place: likewise.
+
+    Returns:
+        The matches, the best attempt and the rows: as they were, where this does not apply or places no more.
+    """
+    count = len(matched.photos)
+    few_features = float(np.median(matched.evidence.features)) < FEW_FEATURES
+    if is_usable(best.registered, count) or few_features or not may_match_all(matched.job.matching, count):
+        return matched, best, rows
+    database = matched.work / DATABASE
+    step = _attempt_progress(progress, len(rows))
+    match(pairs(count, "exhaustive"), matched.photos, database, step, Verification(matched.job.seed))
+    full = replace(matched, evidence=read_verified_matches(database, matched.photos))
+    again, more = try_strategies(full, _rest(progress, len(rows) + 1), place)
+    better = again.registered > best.registered
+    more = [row | {"strategy": f"{row['strategy']}, all pairs matched", "kept": row["kept"] and better} for row in more]
+    rows = [row | {"kept": row["kept"] and not better} for row in rows] + more
+    return (full, again, rows) if better else (matched, best, rows)
 
 
 def _attempt(strategy: Strategy, matched: Matched, progress: Progress, place: Reconstruct) -> Attempt:
     since = time.perf_counter()
     pieces = place(strategy, matched, progress)
     progress(1, 1, "checking poses against the matches")
-    outliers, consistency = {}, None
+    outliers, consistency, straight = {}, None, True
     if pieces:
         outliers = remove_outlier_cameras(pieces[0], matched.photos)
         consistency = check_consistency(pieces[0], matched.photos, matched.evidence)
-    return Attempt(strategy, pieces, outliers, consistency, time.perf_counter() - since)
+        straight = not bent_cameras(pieces[0])
+    return Attempt(strategy, pieces, outliers, consistency, time.perf_counter() - since, straight)
 
 
 def _attempt_progress(progress: Progress, before: int) -> Progress:
@@ -116,6 +177,12 @@ def _attempt_progress(progress: Progress, before: int) -> Progress:
         progress(round(1000 * (start + (1 - start) / 2 * furthest)), 1000, what)
 
     return report
+
+
+def _rest(progress: Progress, before: int) -> Progress:
+    """Progress of all that comes after so many attempts."""
+    start = 1 - 0.5**before
+    return lambda done, total, what: progress(round(1000 * (start + (1 - start) * done / max(total, 1))), 1000, what)
 
 
 def choice(rows: Sequence[dict[str, Any]]) -> str:

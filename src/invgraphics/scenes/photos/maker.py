@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from invgraphics import locks
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, TOP_VIEW, PhotoJob
+from invgraphics.scenes.pictures.masks import FOLDER
 from invgraphics.scenes.process import Progress, run_worker
 from invgraphics.tables import parse_json, read_json
 
@@ -21,7 +23,7 @@ WORK = ".import"
 
 JOB, RESULT = "job.json", "result"
 MATCHES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm")
-RESULTS = ("images", "sparse", TOP_VIEW, QUALITY)
+RESULTS = ("images", FOLDER, "sparse", TOP_VIEW, QUALITY)
 """What the work process leaves for the folder, the proof of completeness last."""
 
 
@@ -113,11 +115,12 @@ def _check_target(job: PhotoJob, out: Path) -> None:
 def _make(job: PhotoJob, key: str, out: Path, progress: Progress, lock: int) -> dict[str, Any]:
     work = out / WORK
     request = work / JOB
-    asked = {"key": key, "matches": job.matches_key(), "job": parse_json(job.text(), "the job")}
+    whole = replace(job, folder=str(job.path.resolve()))  # found again from any other folder
+    asked = {"key": key, "matches": job.matches_key(), "job": parse_json(whole.text(), "the job")}
     left = _read_json(request)
     if left is None or left.get("matches") != asked["matches"]:  # of no use
         _clear(work, ())
-    elif left != asked:
+    elif left.get("key") != key:
         _clear(work, (JOB, *MATCHES))
     write_text(request, json.dumps(asked))
     run_worker(

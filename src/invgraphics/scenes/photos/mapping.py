@@ -75,6 +75,8 @@ def _database(strategy: Strategy, matched: Matched, progress: Progress) -> Path:
     if not (strategy.calibrated or strategy.guided):
         return path
     copy = matched.work / COPY
+    for left in (COPY, f"{COPY}-wal", f"{COPY}-shm"):  # a killed process's log, which SQLite would replay into the new copy
+        (matched.work / left).unlink(missing_ok=True)
     copy_file(path, copy)
     if strategy.guided:
         with pycolmap.Database.open(copy) as database:

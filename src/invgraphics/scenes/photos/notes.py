@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from invgraphics.scenes.photos.maker import read_quality
 
 
-def pose_notes(folder: Path) -> dict[str, str]:
+def pose_notes(folders: Iterable[Path]) -> dict[str, str]:
     """Notes of a `Scene`: ``poses`` names the strategy, ``inconsistent_poses`` the failed consistency check.
 
-    Empty where ``folder`` holds no finished import.
+    Empty where none of ``folders`` holds a finished import; of several that do, the first counts.
     """
-    quality = read_quality(folder)
+    quality = next((found for found in map(read_quality, folders) if found is not None), None)
     if quality is None:
         return {}
     notes = {"poses": str(quality["choice"])} if quality.get("choice") else {}

@@ -1,4 +1,7 @@
-"""Outlier cameras of a reconstruction: few observations, or far from all others. They are deregistered and reported."""
+"""Outlier cameras of a reconstruction: few observations, far from all others, a lens that cannot be removed.
+
+They are deregistered and reported.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from invgraphics.scenes.photos.prepare import Prepared
+from invgraphics.scenes.photos.result import STRAIGHT, lens_of, max_distortion
+from invgraphics.scenes.pictures.lens import straightening_obstacle
 
 FEW_POINTS = 15
 """Fewest observations of a camera that is kept: COLMAP accepts no pair of photographs with fewer verified matches."""
@@ -45,6 +50,31 @@ def remove_outlier_cameras(model: Any, photos: Sequence[Prepared]) -> dict[str, 
     if len(frames) > MOST * len(images):
         return {}
     for frame in frames:
+        model.deregister_frame(frame)
+    return reasons
+
+
+def bent_cameras(model: Any) -> dict[int, str]:
+    """Cameras with photographs whose lenses cannot be removed -> why."""
+    reasons = {}
+    for number in sorted({image.camera_id for image in model.images.values() if image.has_pose}):
+        lens = lens_of(model.cameras[number])
+        if max_distortion(lens) > STRAIGHT and (why := straightening_obstacle(lens)):
+            reasons[number] = why.rstrip(".")
+    return reasons
+
+
+def remove_bent_cameras(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
+    """Deregister the photographs of a ``pycolmap.Reconstruction`` whose lenses cannot be removed.
+
+    Returns:
+        Photograph -> why it was removed.
+    """
+    source = {photo.name: photo.source for photo in photos}
+    bent = bent_cameras(model)
+    images = [image for image in model.images.values() if image.has_pose and image.camera_id in bent]
+    reasons = {source[image.name]: f"no straight picture can be made of it: {bent[image.camera_id]}" for image in images}
+    for frame in {image.frame_id for image in images}:
         model.deregister_frame(frame)
     return reasons
 

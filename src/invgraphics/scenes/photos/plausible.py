@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from invgraphics.scenes.photos.prepare import FOCAL_RANGE
+from invgraphics.scenes.photos.sources import FOCAL_RANGE
 
 LEAST_SPREAD = 0.01
 """Extent of the cameras over the median depth of the points; below it, parallax is a hundredth of the focal length at most."""

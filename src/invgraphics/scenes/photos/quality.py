@@ -77,6 +77,12 @@ def is_usable(registered: int, count: int) -> bool:
     return registered >= max(LEAST, SHARE * count)
 
 
+def placeable(evidence: VerifiedMatches) -> int:
+    """Photographs that may be placed: those with enough features, and verified matches with another."""
+    matched = {index for pair in evidence.pairs for index in (pair.first, pair.second)}
+    return sum(evidence.features[index] >= FEW_FEATURES for index in matched)
+
+
 def registration_obstacle(photos: Sequence[Prepared], evidence: VerifiedMatches) -> tuple[str, str] | None:
     """Why no strategy can register these photographs, and a remedy; ``None`` where one may."""
     longest = max(max(photo.width, photo.height) for photo in photos)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from invgraphics.core import Camera
+from invgraphics.core import Camera, View
 from invgraphics.errors import InputError
 from invgraphics.files import copy_file, write_picture
 from invgraphics.scenes.colmap_sizes import check_sizes
@@ -32,23 +32,25 @@ def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path
     """Write ``images`` and ``sparse/0`` for the photographs that ``model`` places; the model itself is changed on the way.
 
     Returns:
-        The largest distance that a lens moves a pixel of its picture.
+        The largest distance that a lens moves a pixel of a picture that is written.
     """
     (result / "images").mkdir(parents=True, exist_ok=True)
-    lenses = {camera_id: _lens(camera) for camera_id, camera in model.cameras.items()}
-    bends = {camera_id: max_distortion(lens) for camera_id, lens in lenses.items()}
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
     kept = [photo for photo in photos if photo.name in by_name]
+    used = {by_name[photo.name].camera_id for photo in kept}
+    lenses = {camera_id: lens_of(model.cameras[camera_id]) for camera_id in used}
+    bends = {camera_id: max_distortion(lens) for camera_id, lens in lenses.items()}
     for index, photo in enumerate(kept):
         progress(index, len(kept), f"straightening {photo.name}")
         image = by_name[photo.name]
         lens = lenses[image.camera_id] if bends[image.camera_id] > STRAIGHT else None
         _write_picture(work / PHOTOS / photo.name, result / "images" / photo.name, lens)
-        if photo.own_mask:  # of pictures that are pinholes' already
+        if photo.own_mask:
             (result / FOLDER).mkdir(exist_ok=True)
-            copy_file(work / OWN_MASKS / f"{photo.name}.png", result / FOLDER / f"{photo.name}.png")
+            _write_mask(work / OWN_MASKS / f"{photo.name}.png", result / FOLDER / f"{photo.name}.png", lens)
     for camera_id, camera in model.cameras.items():
-        straight = straighten(lenses[camera_id]) if bends[camera_id] > STRAIGHT else None
+        # A camera of removed photographs may have a lens that nothing straightens; no picture of it is written.
+        straight = straighten(lenses[camera_id]) if bends.get(camera_id, 0.0) > STRAIGHT else None
         if straight is not None:
             for image in model.images.values():
                 if image.camera_id == camera_id:
@@ -87,7 +89,8 @@ def max_distortion(lens: Lens) -> float:
     return float(moved.max()) if len(moved) else float(max(lens.width, lens.height))
 
 
-def _lens(camera: Any) -> Lens:
+def lens_of(camera: Any) -> Lens:
+    """Lens of a ``pycolmap.Camera``."""
     return Lens(camera.model_name, tuple(float(value) for value in camera.params), camera.width, camera.height)
 
 
@@ -97,12 +100,26 @@ def _write_picture(source: Path, target: Path, lens: Lens | None) -> None:
     if lens is None:
         copy_file(source, target)
         return
-    pixels = read_pixels(source)
-    unit = torch.ones(2, dtype=torch.float64)  # replaced by the lens's own
-    camera = Camera(torch.eye(4, dtype=torch.float64), unit, unit, lens.width, lens.height)
-    view = make_view(camera, pixels, source.name, lens=lens)
+    view = _straight_view(source, lens)
     alpha = [] if view.alpha is None else [view.alpha[..., None].numpy()]
     write_picture(target, Image.fromarray(np.concatenate([view.image.numpy(), *alpha], axis=-1)), compress_level=1)
+
+
+def _write_mask(source: Path, target: Path, lens: Lens | None) -> None:
+    """A mask, straight as its picture; a pixel counts where all that it is made of do."""
+    from PIL import Image
+
+    if lens is None:
+        copy_file(source, target)
+        return
+    counts = _straight_view(source, lens).image[..., 0].numpy() == 255
+    write_picture(target, Image.fromarray(255 * counts.astype(np.uint8)), compress_level=1)
+
+
+def _straight_view(source: Path, lens: Lens) -> View:
+    unit = torch.ones(2, dtype=torch.float64)  # replaced by the lens's own
+    camera = Camera(torch.eye(4, dtype=torch.float64), unit, unit, lens.width, lens.height)
+    return make_view(camera, read_pixels(source), source.name, lens=lens)
 
 
 def _move_points(image: Any, camera: Any, straight: Straight) -> None:

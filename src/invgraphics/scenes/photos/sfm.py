@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from invgraphics.files import write_text
-from invgraphics.scenes.photos.job import DATABASE, EXHAUSTIVE, MODELS, PhotoJob
+from invgraphics.scenes.photos.job import DATABASE, EXHAUSTIVE, MODELS, SECOND_TRY, PhotoJob
 from invgraphics.scenes.photos.prepare import MASKS, PHOTOS, Prepared
 from invgraphics.scenes.process import Progress
 
@@ -115,6 +115,11 @@ def pairs(count: int, matching: str) -> list[tuple[int, int]]:
         return list(combinations(range(count), 2))
     steps = sorted({*range(1, NEIGHBOURS + 1), *(2**power for power in range(4, NEIGHBOURS))})
     return [(first, first + step) for first in range(count) for step in steps if first + step < count]
+
+
+def may_match_all(matching: str, count: int) -> bool:
+    """Whether all pairs may be compared in a second try: `pairs` chose the neighbours by itself, and it takes no days."""
+    return matching == "auto" and EXHAUSTIVE < count <= SECOND_TRY
 
 
 def match(

@@ -57,8 +57,8 @@ def strategies(job: PhotoJob, photos: Sequence[Prepared]) -> tuple[Strategy, ...
         Strategy("incremental", lens),
         Strategy("global", lens),
         Strategy("incremental", lens, calibrated=True, initial_angle=WIDE_ANGLE),
-        Strategy("global", others[1]),
-        Strategy("incremental", others[0]),
+        Strategy("global" if job.mapper == "auto" else job.mapper, others[1]),
+        Strategy("incremental" if job.mapper == "auto" else job.mapper, others[0]),
         Strategy("incremental" if job.mapper == "incremental" else "global", lens, guided=True),
     ]
     return tuple(dict.fromkeys(row for row in tries if job.mapper in ("auto", row.mapper)))

@@ -15,7 +15,7 @@ from typing import Any
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
 from invgraphics.scenes.photos import sfm
-from invgraphics.scenes.photos.attempts import Attempt, choice, try_strategies
+from invgraphics.scenes.photos.attempts import Attempt, choice, try_all_pairs, try_strategies
 from invgraphics.scenes.photos.job import DATABASE, QUALITY, SCHEMA, TOP_VIEW, PhotoJob
 from invgraphics.scenes.photos.maker import JOB, RESULT
 from invgraphics.scenes.photos.mapping import Matched
@@ -70,7 +70,7 @@ def main(work: Path) -> None:
     clock.start("poses")
     evidence = read_verified_matches(work / DATABASE, preparation.photos)
     matched = Matched(job, preparation.photos, evidence, work)
-    best, attempts = try_strategies(matched, clock.show)
+    matched, best, attempts = try_all_pairs(matched, *try_strategies(matched, clock.show), clock.show)
     quality = _finish(matched, preparation.skipped, best, result, clock) | {"choice": choice(attempts), "attempts": attempts}
     write_text(result / QUALITY, json.dumps({"schema": SCHEMA, "key": asked["key"], **quality}, indent=1))
 
@@ -100,6 +100,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         "job": parse_json(job.text(), "the job"),
         "given": len(photos) + len(skipped),
         "used": len(photos),
+        "masked": sum(photo.own_mask for photo in photos),
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],

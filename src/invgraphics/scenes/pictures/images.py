@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,8 +22,24 @@ from invgraphics.scenes.pictures.lens import Lens
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Suffixes of photographs, in lower case."""
 
+PHONE = (".heic", ".heif", ".avif")
+"""Read where Pillow has a decoder for them."""
+
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+"""Sensor data: what Pillow finds in some of them is a thumbnail."""
+
 _ORIENTATION = 0x0112  # EXIF tag
 _TURNED = (5, 6, 7, 8)  # orientations that exchange width and height
+_UPRIGHT = {
+    2: "FLIP_LEFT_RIGHT", 3: "ROTATE_180", 4: "FLIP_TOP_BOTTOM",
+    5: "TRANSPOSE", 6: "ROTATE_270", 7: "TRANSVERSE", 8: "ROTATE_90",
+}  # fmt: skip
+"""Orientation -> Pillow's name of the transposition that makes the stored picture upright."""
+_OPPOSITE = {6: 8, 8: 6}  # quarter turns; every other orientation undoes itself
+_WIDTH, _HEIGHT = 256, 257  # TIFF tags
+
+UNREADABLE = (OSError, ValueError, SyntaxError, TypeError, KeyError, OverflowError, struct.error)
+"""What Pillow raises about damaged files and about EXIF tags of types that they should not have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +82,18 @@ def image_size(path: Path, like: tuple[int, int] | None = None) -> tuple[int, in
         InputError: the file is missing, no picture, or cut short.
     """
     with _open(path) as image, _naming_damaged_file(path, image):
-        return image.size[::-1] if _is_turned(image, like) else image.size
+        width, height = _stored_size(image)
+        return (height, width) if _is_turned(image, like) else (width, height)
 
 
 def stored_size(path: Path) -> tuple[int, int]:
     """Read width and height in pixels as they are stored, for a camera whose file does not state them.
 
     Raises:
-        InputError: the file is missing or no picture.
+        InputError: the file is missing, no picture, or cut short.
     """
-    with _open(path) as image:
-        return image.size
+    with _open(path) as image, _naming_damaged_file(path, image):
+        return _stored_size(image)
 
 
 def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w c"]:
@@ -93,26 +112,33 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     Raises:
         InputError: the file is missing, no picture, cut short, or of floating-point numbers.
     """
-    from PIL import ImageOps
-
     with _open(path) as image, _naming_damaged_file(path, image):
         if wrong := png.damage(path):
             raise ValueError(wrong)
-        upright = ImageOps.exif_transpose(image) if like is None or _is_turned(image, like) else image
-        if upright.mode.startswith("I"):
-            grey = (np.asarray(upright).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
+        turned = _loaded(image, upright=like is None or _is_turned(image, like))
+        if turned.mode.startswith("I"):
+            grey = (np.asarray(turned).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
-        clear = upright.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in upright.info
-        return np.array(upright.convert("RGBA" if clear else "RGB"))
+        clear = turned.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in turned.info
+        return np.array(turned.convert("RGBA" if clear else "RGB"))
+
+
+def turn_like(pixels: UInt8[np.ndarray, "h w c"], photograph: Path) -> UInt8[np.ndarray, "height width c"]:
+    """Turn pixels that belong to a photograph as it is stored the way that makes it upright."""
+    from PIL import Image
+
+    with _open(photograph) as image, _naming_damaged_file(photograph, image):
+        orientation = _orientation(image)
+    return pixels if orientation == 1 else np.array(Image.fromarray(pixels).transpose(Image.Transpose[_UPRIGHT[orientation]]))
 
 
 @contextmanager
 def _naming_damaged_file(path: Path, image: Any) -> Iterator[None]:
     """Turn decoding errors into an `InputError` that names the file; even its EXIF tags may lie behind the pixels."""
-    width, height = image.size
+    width, height = _stored_size(image)
     try:
         yield
-    except (OSError, ValueError, SyntaxError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{path} is damaged ({width}x{height}): {error}.", "Copy the file again.") from error
 
 
@@ -130,15 +156,50 @@ def _open(path: Path) -> Any:
         return image
     except FileNotFoundError:
         raise InputError(f"{path} does not exist.") from None
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+    except Image.DecompressionBombError as error:
+        count, limit = (
+            re.search(r"\d+", str(error)),
+            2 * (Image.MAX_IMAGE_PIXELS or 0),
+        )  # Pillow warns at half of what it refuses
+        pixels = f"{int(count[0]) / 1e6:,.0f}" if count else "many"
+        sentence = f"{path} has {pixels} million pixels; no more than {limit / 1e6:,.0f} million are read."
+        raise InputError(sentence, "Make it smaller.") from error
+    except (UnidentifiedImageError, *UNREADABLE) as error:
         raise InputError(f"{path} cannot be read as a picture: {type(error).__name__}.", "Copy or convert the file.") from error
+
+
+def _orientation(image: Any) -> int:
+    """EXIF orientation, 1 to 8; 1, as it is stored, where there is none or what is there is no such number."""
+    found = image.getexif().get(_ORIENTATION, 1)
+    return found if found in _UPRIGHT else 1
+
+
+def _stored_size(image: Any) -> tuple[int, int]:
+    """Width and height as stored; the size that Pillow states of a TIFF is that after its orientation is applied."""
+    return (image.tag_v2[_WIDTH], image.tag_v2[_HEIGHT]) if image.format == "TIFF" else image.size
+
+
+def _loaded(image: Any, upright: bool) -> Any:
+    """A picture with its pixels, upright or as they are stored.
+
+    Not by Pillow's `exif_transpose`, which writes EXIF anew and fails at tags of wrong types.
+    """
+    from PIL import Image
+
+    orientation = _orientation(image)
+    image.load()
+    made_upright = _orientation(image) != orientation  # TIFFs, of which Pillow then forgets it
+    if orientation == 1 or upright == made_upright:
+        return image
+    return image.transpose(Image.Transpose[_UPRIGHT[orientation if upright else _OPPOSITE.get(orientation, orientation)]])
 
 
 def _is_turned(image: Any, like: tuple[int, int] | None) -> bool:
     """Whether reading exchanges width and height: EXIF says so, and the camera, if known, has the turned shape only."""
-    if image.getexif().get(_ORIENTATION, 1) not in _TURNED:
+    if _orientation(image) not in _TURNED:
         return False
-    return like is None or (like[0] - like[1]) * (image.width - image.height) < 0
+    width, height = _stored_size(image)
+    return like is None or (like[0] - like[1]) * (width - height) < 0
 
 
 def match_sizes(photos: Sequence[Photo]) -> list[Photo]:

@@ -98,6 +98,15 @@ def straighten(lens: Lens) -> Straight:
     return Straight(focal, centre, grid)
 
 
+def straightening_obstacle(lens: Lens) -> str:
+    """Why `straighten` refuses a lens, in a sentence; empty where it does not. Takes milliseconds."""
+    try:
+        _inner_rectangle(lens.colmap(), lens.width, lens.height)
+    except InputError as error:
+        return error.sentence
+    return ""
+
+
 def _inner_rectangle(camera: Any, width: int, height: int) -> tuple[float, float, float, float]:
     """Rectangle (left, right, top, bottom) on the plane z = 1 that the photograph covers."""
     # Half a pixel inside the border, so that bilinear interpolation never asks for a pixel that is not there.

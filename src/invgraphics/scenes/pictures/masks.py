@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.pictures.images import Photo, file_exists, read_pixels
+from invgraphics.scenes.pictures.images import Photo, file_exists, image_size, read_pixels, turn_like
 
 FOLDER = "masks"
 """Where masks lie beside a folder of photographs."""
@@ -24,18 +24,23 @@ def with_masks_beside(photos: Sequence[Photo], images: Path) -> list[Photo]:
         photos: without masks.
         images: their folder, to which their names are relative.
     """
-    folder = next((place / FOLDER for place in (images, images.parent) if (place / FOLDER).is_dir()), None)
+    folder = masks_folder(images)
     if folder is None:
         return list(photos)
-    masked = [replace(photo, mask=_named_like(photo, folder)) for photo in photos]
+    masked = [replace(photo, mask=mask_of(photo.name, folder)) for photo in photos]
     if photos and not any(photo.mask for photo in masked):
         print(f"{folder} has no mask of any photograph: expected {photos[0].name}.png.", file=sys.stderr)
     return masked
 
 
-def _named_like(photo: Photo, folder: Path) -> Path | None:
+def masks_folder(images: Path) -> Path | None:
+    """`FOLDER` in a folder of photographs, else beside it; ``None`` where there is none."""
+    return next((place / FOLDER for place in (images, images.absolute().parent) if (place / FOLDER).is_dir()), None)
+
+
+def mask_of(name: str, folder: Path) -> Path | None:
     """The mask of a photograph; where names begin with their folder (``images/0.jpg``), those of masks need not."""
-    own = Path(photo.name)
+    own = Path(name)
     names = [folder / name for name in (own, *([Path(*own.parts[1:])] if len(own.parts) > 1 else []))]
     candidates = [path for name in names for path in (name.with_name(name.name + ".png"), name.with_suffix(".png"), name)]
     return next((path for path in candidates if file_exists(path)), None)
@@ -61,6 +66,27 @@ def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]
     bright = values > values.max() // 2
     rows, columns = ((np.arange(count) * stored) // count for count, stored in ((height, high), (width, wide)))
     return np.repeat(np.where(bright, np.uint8(255), np.uint8(0))[rows][:, columns, None], 3, axis=2)
+
+
+def read_upright_mask(mask: Path, photograph: Path, width: int, height: int) -> Bool[np.ndarray, "h w"]:
+    """Read the mask of a photograph that is read upright: drawn on it so, or as it is stored if only that has its shape.
+
+    Args:
+        mask: the file.
+        photograph: whose EXIF orientation counts.
+        width: of the photograph in pixels, upright.
+        height: of the photograph, upright.
+
+    Returns:
+        Which pixels are valid.
+
+    Raises:
+        InputError: as `read_mask` does.
+    """
+    wide, high = image_size(mask, like=(width, height))
+    if (wide - high) * (width - height) >= 0:
+        return read_mask(mask, width, height)[..., 0] == 255
+    return turn_like(read_mask(mask, height, width), photograph)[..., 0] == 255
 
 
 def brightness(pixels: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w"]:
