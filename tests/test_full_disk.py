@@ -218,7 +218,6 @@ def test_appending_is_all_or_nothing(disk: Path) -> None:
 DIRECT = {
     "files.py",
     "memory.py",  # of the kernel, in /proc
-    "runs/folder.py",  # the empty probe of a folder
     "formats/splat.py",  # into the temporary file of `formats.base.write_gaussians`
     "formats/spz.py",
 }
