@@ -140,11 +140,12 @@ def test_workspace_is_found_from_any_of_its_folders(tmp_path: Path, given: str) 
     assert (given == ".") == ("dense/0/sparse (9 photographs)" in said and "sparse/0 (0 of 9" in said)
 
 
+@pytest.mark.parametrize("number", ["1", "10"])
 @pytest.mark.parametrize("given", [".", "sparse", "sparse/0", "images"])
-def test_largest_of_several_models_is_taken(tmp_path: Path, given: str) -> None:
+def test_largest_of_several_models_is_taken(tmp_path: Path, given: str, number: str) -> None:
     """COLMAP numbers models in the order in which it began them; the parts do not share a frame."""
     root = mixed(tmp_path / "garden")
-    (root / "sparse" / "0").rename(root / "sparse" / "1")
+    (root / "sparse" / "0").rename(root / "sparse" / number)
     keep = [path.read_bytes() for path in sorted((root / "images").iterdir())]
     write(root, ring(3), ["PINHOLE 160 120 150 155 83 58"] * 3)
     for index, photo in enumerate(sorted((root / "images").iterdir())):
@@ -154,7 +155,7 @@ def test_largest_of_several_models_is_taken(tmp_path: Path, given: str) -> None:
     assert len(scene.train) + len(scene.test) == (3 if given == "sparse/0" else 9)
     if given == ".":
         assert scene.notes["model"] == (
-            "sparse/1 (9 photographs) has the most photographs; not taken: sparse/0 (3 photographs)"
+            f"sparse/{number} (9 photographs) has the most photographs; not taken: sparse/0 (3 photographs)"
         )
 
 

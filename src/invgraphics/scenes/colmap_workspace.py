@@ -12,7 +12,7 @@ from invgraphics.scenes.colmap_sizes import check_images_text, check_sizes
 from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
 from invgraphics.scenes.pictures.images import file_exists
 
-PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse", "colmap/sparse/*", ".", "[0-9]")
+PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse", "colmap/sparse/*", ".", "[0-9]", "[0-9][0-9]")
 UNDISTORTED = ("dense/sparse", "dense/*/sparse", "undistorted/sparse", "[0-9]/sparse", "dense/*", "dense")
 """Where models are looked for, the usual places first; those of the second tuple come with undistorted photographs."""
 
