@@ -163,3 +163,16 @@ def test_speed_is_the_mean_rate_of_the_probes(monkeypatch) -> None:
     monkeypatch.setattr(later, "_work", lambda: _busy(1e-3))
     later.probe_at(100.0)
     assert later.speed == pytest.approx((4 * 375 + 1000) / 5, rel=0.1)
+
+
+def test_the_probe_takes_no_memory_from_a_fit() -> None:
+    """Its arrays are there before a fit, whose peak is what it takes above the memory held before."""
+    import tracemalloc
+
+    tracemalloc.start()
+    probe = SpeedProbe()
+    probe.probe_at(0.0)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert probe.speed
+    assert taken < 100_000

@@ -79,14 +79,8 @@ class SpeedProbe:
     """
 
     def __init__(self, speed: float = 0.0, probes: int = 0) -> None:
-        rng = np.random.default_rng(0)
-        self._values = rng.random(1 << 14, dtype=np.float32)
-        self._table = rng.random(1 << 20, dtype=np.float32)
-        self._index = rng.integers(0, len(self._table), 1 << 15)
-        self._results = np.empty_like(self._values), np.empty(len(self._index), np.float32)
         self._sum, self.probes = speed * probes, probes
         self._next = 0.0
-        self._work()  # the first one also allocates
 
     @property
     def speed(self) -> float | None:
@@ -104,11 +98,18 @@ class SpeedProbe:
         self._next = clock + PROBE_EVERY
 
     def _work(self) -> None:
-        numbers, gathered = self._results
         for _ in range(8):
-            np.exp(self._values, out=numbers)
-            np.sqrt(numbers, out=numbers)
-        np.take(self._table, self._index, out=gathered, mode="clip")
+            np.exp(_VALUES, out=_RESULTS)
+            np.sqrt(_RESULTS, out=_RESULTS)
+        np.take(_TABLE, _INDEX, out=_GATHERED, mode="clip")
+
+
+# Made when this is imported: memory of the probe is then none of a fit's.
+_VALUES = np.linspace(0, 1, 1 << 14, dtype=np.float32)
+_RESULTS = np.empty_like(_VALUES)
+_TABLE = np.ones(1 << 20, np.float32)
+_INDEX = np.random.default_rng(0).integers(0, len(_TABLE), 1 << 15)
+_GATHERED = np.ones(len(_INDEX), np.float32)
 
 
 def _waited(times: Mapping[str, tuple[int, int]]) -> int:

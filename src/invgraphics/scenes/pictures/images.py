@@ -157,10 +157,8 @@ def _open(path: Path) -> Any:
     except FileNotFoundError:
         raise InputError(f"{path} does not exist.") from None
     except Image.DecompressionBombError as error:
-        count, limit = (
-            re.search(r"\d+", str(error)),
-            2 * (Image.MAX_IMAGE_PIXELS or 0),
-        )  # Pillow warns at half of what it refuses
+        count = re.search(r"\d+", str(error))
+        limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)  # Pillow warns at half of what it refuses
         pixels = f"{int(count[0]) / 1e6:,.0f}" if count else "many"
         sentence = f"{path} has {pixels} million pixels; no more than {limit / 1e6:,.0f} million are read."
         raise InputError(sentence, "Make it smaller.") from error
