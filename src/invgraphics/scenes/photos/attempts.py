@@ -12,7 +12,11 @@ import numpy as np
 from invgraphics.scenes.photos.consistency import check_consistency
 from invgraphics.scenes.photos.job import DATABASE
 from invgraphics.scenes.photos.mapping import Matched, reconstruct
-from invgraphics.scenes.photos.outlier_cameras import bent_cameras, remove_bent_cameras, remove_outlier_cameras
+from invgraphics.scenes.photos.outlier_cameras import (
+    remove_outlier_cameras,
+    remove_uncorrectable_cameras,
+    uncorrectable_cameras,
+)
 from invgraphics.scenes.photos.pairs import read_verified_matches
 from invgraphics.scenes.photos.quality import FEW_FEATURES, is_usable, placeable, registration_obstacle
 from invgraphics.scenes.photos.sfm import Verification, match, may_match_all, pairs
@@ -35,7 +39,7 @@ class Attempt:
         outliers: photograph -> why its camera was removed from the largest piece.
         consistency: see `invgraphics.scenes.photos.consistency.check_consistency`; ``None`` where nothing was placed.
         seconds: that it took.
-        straight: whether all lenses of the largest piece can be removed.
+        straight: whether the distortion of all lenses of the largest piece can be corrected.
     """
 
     strategy: Strategy
@@ -51,12 +55,12 @@ class Attempt:
         return self.pieces[0].num_reg_images() if self.pieces else 0
 
     def is_sound(self, count: int) -> bool:
-        """Whether a usable share of ``count`` photographs is placed, their lenses can be removed, and nothing is suspicious."""
+        """Whether a usable share of ``count`` photographs is placed, their lenses' distortion can be corrected, and nothing is suspicious."""
         trusted = self.consistency is not None and not self.consistency["suspicious"]
         return trusted and self.straight and is_usable(self.registered, count)
 
     def rank(self, count: int) -> tuple[bool, bool, int, float]:
-        """Sorting key, best last: whether it is sound, whether all lenses can be removed, then how many photographs are placed
+        """Sorting key, best last: whether it is sound, whether all distortion can be corrected, then how many photographs are placed
         and the share of all verified matches that the poses explain; of unsound ones that share alone."""
         if self.consistency is None:
             return False, False, 0, -1.0
@@ -64,10 +68,10 @@ class Attempt:
         return sound, self.straight, self.registered if sound else 0, self.consistency["support"]
 
     def straightened(self, matched: Matched) -> Attempt:
-        """The attempt without the photographs whose lenses cannot be removed; of less than a pair nothing is left."""
+        """The attempt without the photographs whose distortion cannot be corrected; of less than a pair nothing is left."""
         if self.straight:
             return self
-        removed = remove_bent_cameras(self.pieces[0], matched.photos)
+        removed = remove_uncorrectable_cameras(self.pieces[0], matched.photos)
         outliers = self.outliers | removed
         if self.registered < 2:
             return replace(self, pieces=[], outliers=outliers, consistency=None, straight=True)
@@ -163,7 +167,7 @@ def _attempt(strategy: Strategy, matched: Matched, progress: Progress, place: Re
     if pieces:
         outliers = remove_outlier_cameras(pieces[0], matched.photos)
         consistency = check_consistency(pieces[0], matched.photos, matched.evidence)
-        straight = not bent_cameras(pieces[0])
+        straight = not uncorrectable_cameras(pieces[0])
     return Attempt(strategy, pieces, outliers, consistency, time.perf_counter() - since, straight)
 
 

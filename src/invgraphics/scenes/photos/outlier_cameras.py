@@ -1,4 +1,4 @@
-"""Outlier cameras of a reconstruction: few observations, far from all others, a lens that cannot be removed.
+"""Outlier cameras of a reconstruction: few observations, far from all others, a distortion that cannot be corrected.
 
 They are deregistered and reported.
 """
@@ -54,8 +54,8 @@ def remove_outlier_cameras(model: Any, photos: Sequence[Prepared]) -> dict[str, 
     return reasons
 
 
-def bent_cameras(model: Any) -> dict[int, str]:
-    """Cameras with photographs whose lenses cannot be removed -> why."""
+def uncorrectable_cameras(model: Any) -> dict[int, str]:
+    """Cameras with photographs whose lens distortion cannot be corrected -> why."""
     reasons = {}
     for number in sorted({image.camera_id for image in model.images.values() if image.has_pose}):
         lens = lens_of(model.cameras[number])
@@ -64,16 +64,16 @@ def bent_cameras(model: Any) -> dict[int, str]:
     return reasons
 
 
-def remove_bent_cameras(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
-    """Deregister the photographs of a ``pycolmap.Reconstruction`` whose lenses cannot be removed.
+def remove_uncorrectable_cameras(model: Any, photos: Sequence[Prepared]) -> dict[str, str]:
+    """Deregister the photographs of a ``pycolmap.Reconstruction`` whose distortion cannot be corrected.
 
     Returns:
         Photograph -> why it was removed.
     """
     source = {photo.name: photo.source for photo in photos}
-    bent = bent_cameras(model)
-    images = [image for image in model.images.values() if image.has_pose and image.camera_id in bent]
-    reasons = {source[image.name]: f"no straight picture can be made of it: {bent[image.camera_id]}" for image in images}
+    reason = uncorrectable_cameras(model)
+    images = [image for image in model.images.values() if image.has_pose and image.camera_id in reason]
+    reasons = {source[image.name]: f"no straight picture can be made of it: {reason[image.camera_id]}" for image in images}
     for frame in {image.frame_id for image in images}:
         model.deregister_frame(frame)
     return reasons
