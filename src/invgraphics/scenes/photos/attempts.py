@@ -55,13 +55,13 @@ class Attempt:
         return self.pieces[0].num_reg_images() if self.pieces else 0
 
     def is_sound(self, count: int) -> bool:
-        """Whether a usable share of ``count`` photographs is placed, their lenses' distortion can be corrected, and nothing is suspicious."""
+        """Whether enough of ``count`` photographs are placed, all distortion can be corrected, and nothing is suspicious."""
         trusted = self.consistency is not None and not self.consistency["suspicious"]
         return trusted and self.straight and is_usable(self.registered, count)
 
     def rank(self, count: int) -> tuple[bool, bool, int, float]:
-        """Sorting key, best last: whether it is sound, whether all distortion can be corrected, then how many photographs are placed
-        and the share of all verified matches that the poses explain; of unsound ones that share alone."""
+        """Sorting key, best last: whether it is sound, whether all distortion can be corrected, then how many photographs are
+        placed and the share of all verified matches that the poses explain; of unsound ones that share alone."""
         if self.consistency is None:
             return False, False, 0, -1.0
         sound = self.is_sound(count)
