@@ -86,3 +86,27 @@ def test_tensors_that_are_not_contiguous():
     numba.adam_rows(turned, gradient, (copies[0], copies[1]), step)
     numba.adam_rows(values, gradient, moments, step)
     torch.testing.assert_close(turned, values)
+
+
+@pytest.mark.parametrize("kernels", [reference, numba])
+@pytest.mark.parametrize("shape", [(300, 1), (6, 5, 10, 12), (300, 28)])
+@pytest.mark.parametrize("per_row", [True, False])
+def test_a_gradient_of_some_rows_steps_these_alone(kernels, shape, per_row):
+    values, gradient, moments = tensors(shape)
+    rows = torch.randperm(300)[:40].sort().values
+    some, whole = gradient.reshape(300, -1)[rows], torch.zeros(300, shape[-1])
+    whole[rows] = some
+    rates, step = torch.rand(shape[:-1]) if per_row else None, AdamStep(0.1, *BETAS, 1e-12, 3)
+    copies = [x.clone() for x in (values, *moments)]
+    kernels.adam_rows(values, some, moments, step, rates, rows)
+    reference.adam_rows(copies[0], whole.reshape(shape), (copies[1], copies[2]), step, rates)
+    for found, true in zip((values, *moments), copies, strict=True):
+        torch.testing.assert_close(found, true, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kernels", [reference, numba])
+def test_a_gradient_of_no_row_changes_nothing(kernels):
+    values, gradient, moments = tensors((30, 4))
+    before = [x.clone() for x in (values, *moments)]
+    kernels.adam_rows(values, gradient[:0], moments, AdamStep(0.1, *BETAS, 1e-12, 2), None, torch.zeros(0, dtype=torch.int64))
+    assert all(torch.equal(x, old) for x, old in zip((values, *moments), before, strict=True))

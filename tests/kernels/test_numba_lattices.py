@@ -1,5 +1,7 @@
 """Numba's lattice encoding against the plain reference in float64: features, gradients, and gradients of gradients."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from lattice_cases import VM_AXES, derivatives, lattice, linked
@@ -123,3 +125,77 @@ def test_rows_are_shared_out_by_work():
     visits, _ = torch.tensor((cell[0] * 32 + cell[1]) * 32 + cell[2]).sort()
     shares = torch.searchsorted(visits, torch.from_numpy(starts)).diff() / len(visits)
     assert (shares - 0.25).abs().max() < 0.1
+
+
+LARGE = (40, 30, 20)
+"""Vertices of lattices that are large for `FEW` points."""
+FEW = UNIT[-40:]
+
+
+def gradients(lattices, combine, **options):
+    """Gradients of all features, of a weighted sum at few points."""
+    leaves = [x.features.detach().clone().requires_grad_() for x in lattices]
+    out = numba.lattice_encode(FEW, [replace(x, features=f) for x, f in zip(lattices, leaves, strict=True)], combine, **options)
+    return torch.autograd.grad((out * torch.arange(out.numel()).reshape(out.shape).sin()).sum(), leaves)
+
+
+def assert_sparse_equals_dense(lattices, combine, sparse):
+    """The same bits, on one thread and two; ``sparse``: which lattices' gradients are."""
+    before = torch.get_num_threads()
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            found, whole = gradients(lattices, combine, sparse_gradients=True), gradients(lattices, combine)
+            assert [x.is_sparse for x in found] == sparse
+            assert not any(x.is_sparse for x in whole)
+            for one, dense in zip(found, whole, strict=True):
+                assert one.shape == dense.shape
+                assert (dense != 0).any()
+                assert torch.equal(one.to_dense(), dense)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_sparse_gradients_of_voxels():
+    lattices = [lattice("xyz", 3, LARGE), lattice("xyz", 1, (3, 4, 5)), lattice("zxy", 12, LARGE), lattice("xz", 40, LARGE)]
+    assert_sparse_equals_dense(lattices, "concat", [True, False, True, True])
+    assert_sparse_equals_dense([lattice(axes, 20, LARGE) for axes in ("xy", "xyz")], "sum", [True, True])
+
+
+def test_sparse_gradients_of_linked_voxels():
+    shared = torch.randint(-300, 9000, LARGE, dtype=torch.int32)
+    lattices = [linked(5, rows=9000, sizes=LARGE), Lattice(torch.randn(8000, 3), "xyz", shared)]
+    assert_sparse_equals_dense(lattices, "concat", [True, True])
+    increasing = torch.where(torch.rand(LARGE) < 0.6, torch.arange(24000).reshape(LARGE), -1).to(torch.int32)
+    assert_sparse_equals_dense([Lattice(torch.randn(24000, 4), "xyz", increasing)], "concat", [True])
+
+
+def test_a_sparse_gradient_holds_the_corners_of_the_points_cells_alone():
+    (found,) = gradients([lattice("xyz", 12, LARGE)], "concat", sparse_gradients=True)
+    vertices, cells = found.coalesce().indices().T, torch.tensor(LARGE) - 1
+    steps = (vertices[:, None] - FEW.clamp(0, 1) * cells).abs().amax(dim=2)
+    assert (steps.amin(dim=1) <= 1).all()
+    assert 8 < len(vertices) <= 8 * len(FEW)
+
+
+def test_gradients_of_factors_and_those_differentiated_again_are_dense():
+    factors = [lattice("xyz", 12, LARGE), lattice("zyx", 12, LARGE)]
+    assert not any(x.is_sparse for x in gradients(factors, "cp", sparse_gradients=True))
+    features = factors[0].features.clone().requires_grad_()
+    out = numba.lattice_encode(FEW, [Lattice(features)], sparse_gradients=True)
+    (first,) = torch.autograd.grad((out**2).sum(), features, create_graph=True)
+    assert not first.is_sparse
+    (second,) = torch.autograd.grad((first**2).sum(), features)
+    assert (second.to_dense() != 0).any()
+
+
+@pytest.mark.parametrize("penalty", [False, True])
+def test_sparse_gradients_add_up(penalty):
+    """Those of two calls, and the dense one of a penalty."""
+    features, found = torch.randn(*LARGE, 4, requires_grad=True), []
+    for sparse in (True, False):
+        out = [numba.lattice_encode(unit, [Lattice(features)], sparse_gradients=sparse) for unit in (FEW, FEW[:9] ** 2)]
+        total = sum((one**2).sum() for one in out) + ((0.1 * features**2).sum() if penalty else 0.0)
+        found += torch.autograd.grad(total, features)
+    assert [x.is_sparse for x in found] == [not penalty, False]
+    torch.testing.assert_close(found[0].to_dense(), found[1], atol=1e-5, rtol=1e-5)

@@ -140,3 +140,27 @@ def test_a_process_that_fits_imports_no_compiler():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("places", [[0, 5, 7], [7, 0, 5], [7, 0, 7]])
+def test_sparse_gradients_step_as_dense_ones(places):
+    """Whether their rows are in order, are not, or come twice."""
+    (some, sparsely), (whole, densely) = made(), made()
+    rates = torch.rand(4, 3)
+    for number in range(3):
+        at, values = torch.tensor(places) + number, torch.randn(3, 2)
+        gradient = torch.sparse_coo_tensor(torch.stack([at // 3, at % 3]), values, (4, 3, 2), check_invariants=True)
+        some["field.grid"].grad, whole["field.grid"].grad = gradient, gradient.to_dense()
+        sparsely.step()
+        densely.step()
+        if number == 0:
+            sparsely.set_row_rates("field.grid", rates)
+            densely.set_row_rates("field.grid", rates)
+    torch.testing.assert_close(some["field.grid"], whole["field.grid"], atol=1e-6, rtol=1e-6)
+    assert (some["field.grid"] != 1).flatten(1).any(1).sum() > 1
+
+
+def test_only_parameters_whose_zeros_are_skipped_may_have_sparse_gradients():
+    _, optimiser = made()
+    assert optimiser.skips_zero("field.grid")
+    assert not optimiser.skips_zero("field.net")

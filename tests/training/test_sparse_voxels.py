@@ -9,6 +9,7 @@ from invgraphics.core.lattice import Lattice, LatticeEncoding
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_plan
 from invgraphics.fields.encodings.sparse import SparseVoxels, SparseVoxelsConfig
+from invgraphics.kernels.numba.lattice import encode
 from invgraphics.kernels.reference.lattice import lattice_encode
 from invgraphics.recipes.recipe import load_method
 from invgraphics.runs import checkpoint
@@ -173,10 +174,31 @@ def psnr(fit) -> float:
 DVGO = ["field.encoding.resolution=16", "field.appearance.resolution=16", "hooks.0.resolution=16", "hooks.1.resolution=24"]
 
 
-@pytest.mark.parametrize(
-    ("name", "settings"),
-    [("volumetric/plenoxels", SMALL), ("volumetric/dvgo", [*SMALL[:2], *SMALL[4:7], *DVGO, "field.colour_width=16"])],
-)
+SKIPPING = [("volumetric/plenoxels", SMALL), ("volumetric/dvgo", [*SMALL[:2], *SMALL[4:7], *DVGO, "field.colour_width=16"])]
+"""Methods whose optimiser skips entries without gradient."""
+
+
+@pytest.mark.parametrize(("name", "settings"), SKIPPING)
+def test_sparse_gradients_change_no_fit(name, settings, scene, monkeypatch):
+    """Through pruning and up-sampling; on grids of this size gradients are dense unless the limit is lowered."""
+    found = []
+    for large in (encode.LARGE, 1e-6):
+        monkeypatch.setattr(encode, "LARGE", large)
+        torch.manual_seed(0)
+        fit = Fit(build_plan(load_method(name, None, settings), scene, Budget(steps=12), 0, torch.device("cpu")))
+        kinds = set()
+
+        def note(loss, fit=fit, kinds=kinds):
+            kinds.update(x.grad.is_sparse for x in fit.model.field.parameters() if x.grad is not None and x.numel() > 4000)
+
+        fit.run(note)
+        assert (True in kinds) == (large < 1)  # beside dense ones, of Plenoxels' total variation
+        found.append({key: value.detach().clone() for key, value in fit.model.field.named_parameters()})
+    for key, value in found[0].items():
+        torch.testing.assert_close(found[1][key], value, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "settings"), SKIPPING)
 def test_methods_learn_the_toy_scene(name, settings, scene):
     method = load_method(name, None, settings)
     fit = Fit(build_plan(method, scene, Budget(steps=120), 0, torch.device("cpu")))

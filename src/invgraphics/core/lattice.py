@@ -190,6 +190,17 @@ class LatticeEncoding(Protocol):
 
 
 @runtime_checkable
+class SparseGradientModule(Protocol):
+    """Protocol of modules whose parameters can have sparse gradients, as those of torch's ``Embedding``.
+
+    Attributes:
+        sparse_gradients: whether they may; set by a fit whose optimiser skips entries without gradient.
+    """
+
+    sparse_gradients: bool
+
+
+@runtime_checkable
 class LatticeField(Protocol):
     """Protocol of fields with encodings made of lattices."""
 

@@ -49,7 +49,10 @@ def hash_encode(
 
 
 def lattice_encode(
-    unit: Float[Tensor, "m 3"], lattices: Sequence[lattice.Lattice], combine: lattice.Combination = "concat"
+    unit: Float[Tensor, "m 3"],
+    lattices: Sequence[lattice.Lattice],
+    combine: lattice.Combination = "concat",
+    sparse_gradients: bool = False,
 ) -> Float[Tensor, "m width"]:
     """Linear, bilinear and trilinear interpolation of features on lines, planes and voxel grids, combined per point.
 
@@ -59,6 +62,9 @@ def lattice_encode(
         unit: positions in [0, 1]; those outside are clamped, NaN counts as 0.
         lattices: dense or linked lattices, features of ``unit``'s dtype and device.
         combine: concatenation, sum, VM or CP product (see `core.lattice.Combination`).
+        sparse_gradients: allow gradients of features that are sparse tensors of the rows around the points, as torch's
+            ``embedding`` has them: their cost does not grow with the lattice. On the CPU, of large lattices that are not
+            factors of a product, unless the graph of the gradient is asked for; all others stay dense.
 
     Returns:
         Features, differentiable twice in ``unit`` and in every lattice's features; the gradient along axes on which a position
@@ -69,15 +75,16 @@ def lattice_encode(
         InputError: lattices that do not fit together or do not fit the positions.
     """
     lattice.check_lattices(unit, lattices, combine)
-    return choose("lattice_encode", unit)(unit, lattices, combine)
+    return choose("lattice_encode", unit)(unit, lattices, combine, sparse_gradients)
 
 
 def adam_rows(
     values: Float[Tensor, "*rows c"],
-    gradient: Float[Tensor, "*rows c"],
+    gradient: Float[Tensor, "*rows c"] | Float[Tensor, "k c"],
     moments: tuple[Float[Tensor, "*rows c"], Float[Tensor, "*rows c"]],
     step: types.AdamStep,
     rates: Float[Tensor, "*rows"] | None = None,
+    rows: Int[Tensor, " k"] | None = None,
 ) -> None:
     """Adam step in place, on the entries with a gradient only (masked Adam of DVGO, Sun et al. 2022, `lib/cuda/adam_upd`).
 
@@ -87,13 +94,15 @@ def adam_rows(
 
     Args:
         values: what is updated; rows of c.
-        gradient: of the same shape.
+        gradient: of the same shape, or of the ``rows`` alone.
         moments: first and second moment, updated too.
         step: settings, number of the step, and whether zeros are skipped.
         rates: factor of the learning rate of each row, for instance its share of the most views that see a voxel (DVGO,
             §4.2); ``None`` for 1.
+        rows: which rows ``gradient`` has, each once, int64, in the order of memory; all others keep value and moments.
+            ``None`` for all.
     """
-    choose("adam_rows", values)(values, gradient, moments, step, rates)
+    choose("adam_rows", values)(values, gradient, moments, step, rates, rows)
 
 
 def ray_march(

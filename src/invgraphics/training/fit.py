@@ -22,7 +22,7 @@ from invgraphics.training.budget import Budget
 from invgraphics.training.clock import SchedulerTimes, SpeedProbe
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
-from invgraphics.training.optimiser import Optimiser, OptimiserConfig
+from invgraphics.training.optimiser import Optimiser, OptimiserConfig, allow_sparse_gradients
 from invgraphics.training.penalties import Penalty, check_penalty
 from invgraphics.training.poses import Poses, coarse_to_fine_encodings
 from invgraphics.training.views.exposure import Exposures
@@ -108,7 +108,10 @@ class Fit:
             if parameter.requires_grad
         }
         self._trainable = bool(parameters)
-        return Optimiser(self.plan.optimiser, parameters, self.plan.scene.extent)
+        optimiser = Optimiser(self.plan.optimiser, parameters, self.plan.scene.extent)
+        for owner, module in self.plan.modules.items():
+            allow_sparse_gradients(module, owner, optimiser)
+        return optimiser
 
     @property
     def model(self) -> Model:

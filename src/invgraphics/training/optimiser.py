@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from invgraphics.core.lattice import SparseGradientModule
 from invgraphics.errors import InputError
 from invgraphics.training.optimisers.adam import MOMENTS, ROW_RATES, DenseAdam, GroupedOptimiser, MaskedAdam
 from invgraphics.training.optimisers.muon import MOMENTUM, Muon, takes_muon
@@ -168,6 +169,10 @@ class Optimiser:
         for one in self._optimisers:
             one.step()
 
+    def skips_zero(self, name: str) -> bool:
+        """Whether entries of a parameter without gradient stay as they are, so that its gradient may be a sparse tensor."""
+        return isinstance(self._optimiser_of(name), MaskedAdam)
+
     def row_rates(self, name: str) -> Float[Tensor, "*rows"] | None:
         """Factors of the learning rate of a parameter's rows; ``None`` for 1."""
         return self._optimiser_of(name).state.get(self._names[name], {}).get(ROW_RATES)
@@ -255,6 +260,20 @@ class Optimiser:
                 continue
             name, _, key = path.rpartition("/")
             self._optimiser_of(name).state[self._names[name]][key] = value.clone()
+
+
+def allow_sparse_gradients(module: nn.Module, name: str, optimiser: Optimiser) -> None:
+    """Let all parts of a module have sparse gradients of whose parameters the optimiser skips entries without gradient.
+
+    Args:
+        module: whose parameters the optimiser has.
+        name: of the module; its parameters' names begin with it and a dot.
+        optimiser: of these parameters.
+    """
+    for path, part in module.named_modules(prefix=name):
+        if isinstance(part, SparseGradientModule) and isinstance(part, nn.Module):
+            names = [f"{path}.{key}" for key, parameter in part.named_parameters() if parameter.requires_grad]
+            part.sparse_gradients = bool(names) and all(optimiser.skips_zero(key) for key in names)
 
 
 def _split_params(

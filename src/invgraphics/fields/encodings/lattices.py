@@ -55,7 +55,10 @@ class LatticeFeatures(Encoding):
 
     Attributes:
         width: number of combined features.
+        sparse_gradients: whether its parameters may have sparse gradients (see `core.lattice.SparseGradientModule`).
     """
+
+    sparse_gradients: bool = False
 
     def __init__(
         self, features: Mapping[Place, Float[Tensor, "*vertices c"]], combine: Combination, scale: float = 1.0
@@ -111,7 +114,7 @@ class LatticeFeatures(Encoding):
 
     def forward(self, unit: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"] | None = None) -> Float[Tensor, "m f"]:
         """Features at ``unit``, differentiable twice; ``covariance`` is not used."""
-        features = kernels.lattice_encode(unit, self.lattices(), self.combine)
+        features = kernels.lattice_encode(unit, self.lattices(), self.combine, self.sparse_gradients)
         return features if self.scale == 1.0 else features * self.scale
 
     def _group(self, place: Place) -> nn.ParameterDict:

@@ -59,10 +59,12 @@ class SparseVoxels(Encoding):
     Attributes:
         rows: features of the kept vertices, in the order of memory.
         links: row of each vertex, -1 for none.
+        sparse_gradients: whether ``rows`` may have a sparse gradient (see `core.lattice.SparseGradientModule`).
     """
 
     combine: Combination = "concat"
     scale: float = 1.0
+    sparse_gradients: bool = False
     rows: Tensor
     links: Tensor
 
@@ -85,7 +87,7 @@ class SparseVoxels(Encoding):
 
     def forward(self, unit: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"] | None = None) -> Float[Tensor, "m f"]:
         """Features at ``unit``, differentiable twice; ``covariance`` is not used."""
-        return kernels.lattice_encode(unit, self.lattices(), self.combine)
+        return kernels.lattice_encode(unit, self.lattices(), self.combine, self.sparse_gradients)
 
     @torch.no_grad()
     def keep(self, kept: Bool[Tensor, "x y z"]) -> Int[Tensor, " k"]:

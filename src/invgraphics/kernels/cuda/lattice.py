@@ -152,9 +152,12 @@ class _Interpolate(torch.autograd.Function):
 
 
 def lattice_encode(
-    unit: Float[Tensor, "m 3"], lattices: Sequence[Lattice], combine: Combination = "concat"
+    unit: Float[Tensor, "m 3"],
+    lattices: Sequence[Lattice],
+    combine: Combination = "concat",
+    sparse_gradients: bool = False,
 ) -> Float[Tensor, "m width"]:
-    """See `invgraphics.kernels.lattice_encode`; the derivative of its gradient is the reference's."""
+    """See `invgraphics.kernels.lattice_encode`; gradients are dense, and the derivative of the gradient is the reference's."""
     bare = (replace(lattice, features=lattice.features.detach()) for lattice in lattices)
     # Contiguous before autograd sees them, lest what is differentiated again be copies outside the graph.
     unit, features = unit.contiguous(), [lattice.features.contiguous() for lattice in lattices]

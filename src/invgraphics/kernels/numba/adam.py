@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from invgraphics.kernels import reference
@@ -41,13 +41,13 @@ def _stepped(found, factor, numbers, skip):
 
 
 @inlined
-def _update(arrays, first, end, factor, numbers, skip):
-    """Step of consecutive entries; ``numbers`` are the decays, their complements and eps."""
+def _update(arrays, first, end, source, factor, numbers, skip):
+    """Step of consecutive entries, whose gradients begin at ``source``; ``numbers``: decays, their complements and eps."""
     values, gradient, mean, square = arrays
-    whole = first + (end - first) // REGISTER * REGISTER
+    whole, ahead = first + (end - first) // REGISTER * REGISTER, source - first
     for start in range(first, whole, REGISTER):
         i = index(start)
-        found = load(values, i), load(gradient, i), load(mean, i), load(square, i)
+        found = load(values, i), load(gradient, index(start + ahead)), load(mean, i), load(square, i)
         value, m, v = _stepped(found, factor, numbers, skip)
         store(values, i, value)
         store(mean, i, m)
@@ -56,7 +56,7 @@ def _update(arrays, first, end, factor, numbers, skip):
         i, part = index(whole), index(end - whole)
         found = (
             load_first(values, i, part),
-            load_first(gradient, i, part),
+            load_first(gradient, index(whole + ahead), part),
             load_first(mean, i, part),
             load_first(square, i, part),
         )
@@ -67,35 +67,42 @@ def _update(arrays, first, end, factor, numbers, skip):
 
 
 @parallel
-def adam(arrays, rates, width, size, numbers, skip, jobs):
-    """One step of flat ``arrays``: values, gradient and moments, rows of ``width``; ``rates`` per row, or empty."""
+def adam(arrays, rates, rows, width, size, numbers, skip, jobs):
+    """One step of flat ``arrays``: values, gradient and moments, rows of ``width``; ``rates`` per row, or empty.
+
+    ``rows`` are those that the gradient has; empty for all.
+    """
     gradient = arrays[1]
-    rows = len(gradient) // width
+    count = len(gradient) // width
     for job in prange(jobs):
-        if len(rates) > 0:
-            for row in range(job_start(rows, jobs, job), job_start(rows, jobs, job + 1)):
-                first, end = row * width, (row + 1) * width
-                if not skip or _any_touched(gradient, first, end):
-                    _update(arrays, first, end, size * rates[index(row)], numbers, skip)
+        if len(rates) > 0 or len(rows) > 0:
+            for number in range(job_start(count, jobs, job), job_start(count, jobs, job + 1)):
+                row = rows[index(number)] if len(rows) > 0 else np.int64(number)
+                rate = rates[index(row)] if len(rates) > 0 else ONE
+                source = number * width
+                if not skip or _any_touched(gradient, source, source + width):
+                    _update(arrays, row * width, (row + 1) * width, source, size * rate, numbers, skip)
         else:
-            until = job_start(rows, jobs, job + 1) * width
-            for first in range(job_start(rows, jobs, job) * width, until, GROUP):
+            until = job_start(count, jobs, job + 1) * width
+            for first in range(job_start(count, jobs, job) * width, until, GROUP):
                 end = min(first + GROUP, until)
                 if not skip or _any_touched(gradient, first, end):
-                    _update(arrays, first, end, size, numbers, skip)
+                    _update(arrays, first, end, first, size, numbers, skip)
 
 
 def adam_rows(
     values: Float[Tensor, "*rows c"],
-    gradient: Float[Tensor, "*rows c"],
+    gradient: Float[Tensor, "*rows c"] | Float[Tensor, "k c"],
     moments: tuple[Float[Tensor, "*rows c"], Float[Tensor, "*rows c"]],
     step: AdamStep,
     rates: Float[Tensor, "*rows"] | None = None,
+    rows: Int[Tensor, " k"] | None = None,
 ) -> None:
     """See `invgraphics.kernels.adam_rows`; tensors that are not contiguous are left to the reference."""
-    if not all(tensor.is_contiguous() for tensor in (values, *moments)) or values.numel() == 0:
-        return reference.adam_rows(values, gradient, moments, step, rates)
+    if not all(tensor.is_contiguous() for tensor in (values, *moments)) or gradient.numel() == 0:
+        return reference.adam_rows(values, gradient, moments, step, rates, rows)
     arrays = tuple(array(tensor).reshape(-1) for tensor in (values, gradient, *moments))
     numbers = tuple(np.float32(x) for x in (step.beta1, step.beta2, 1 - step.beta1, 1 - step.beta2, step.eps))
     each = np.empty(0, np.float32) if rates is None else array(rates.to(torch.float32)).reshape(-1)
-    adam(arrays, each, values.shape[-1], np.float32(step.size), numbers, step.skip_zero, threads())
+    some = np.empty(0, np.int64) if rows is None else array(rows)
+    adam(arrays, each, some, values.shape[-1], np.float32(step.size), numbers, step.skip_zero, threads())

@@ -22,6 +22,7 @@ from invgraphics.kernels.numba.gaussians.integrate import gaussian_integrals
 from invgraphics.kernels.numba.gaussians.ordered import gaussian_composites
 from invgraphics.kernels.numba.hash.encode import hash_encode
 from invgraphics.kernels.numba.lattice.encode import lattice_encode
+from invgraphics.kernels.numba.lattice.touched import touched_rows
 from invgraphics.kernels.numba.mesh.interpolate import mesh_interpolate
 from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise
 from invgraphics.kernels.numba.near import near_points
@@ -87,6 +88,7 @@ def samples() -> None:
     (gradient,) = torch.autograd.grad(scaled.sum(), unit, create_graph=True)
     factors = [Lattice(torch.zeros(2, 1).requires_grad_(), axis) for axis in "xy"]
     values = lattice_encode(unit, factors, "cp")
+    touched_rows(unit.detach().T.contiguous().numpy(), Lattice(torch.zeros(2, 2, 2, 1)), "lattice.slots")
     rows = [torch.ones(2, 1) for _ in range(4)]
     adam_rows(rows[0], rows[1], (rows[2], rows[3]), AdamStep(0.1, 0.9, 0.99, 1e-15, 1), torch.ones(2))
     ray = torch.zeros(2, dtype=torch.int64)

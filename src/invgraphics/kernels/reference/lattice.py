@@ -78,9 +78,12 @@ def interpolate(unit: Float[Tensor, "m 3"], lattice: Lattice) -> Float[Tensor, "
 
 
 def lattice_encode(
-    unit: Float[Tensor, "m 3"], lattices: Sequence[Lattice], combine: Combination = "concat"
+    unit: Float[Tensor, "m 3"],
+    lattices: Sequence[Lattice],
+    combine: Combination = "concat",
+    sparse_gradients: bool = False,
 ) -> Float[Tensor, "m width"]:
-    """See `invgraphics.kernels.lattice_encode`."""
+    """See `invgraphics.kernels.lattice_encode`; gradients are dense."""
     return combine_features([interpolate(unit, lattice) for lattice in lattices], combine)
 
 

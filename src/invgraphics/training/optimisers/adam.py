@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from typing import Any, final
 
 import torch
+from jaxtyping import Int
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
@@ -106,7 +107,7 @@ class DenseAdam(Adam):
 
 @final
 class MaskedAdam(Adam):
-    """Adam by `kernels.adam_rows`: entries whose gradient is exactly 0 keep value and moments.
+    """Adam by `kernels.adam_rows`: entries whose gradient is exactly 0 keep value and moments. Gradients may be sparse.
 
     A parameter's state has `ROW_RATES` too, where it has such.
     """
@@ -120,4 +121,28 @@ class MaskedAdam(Adam):
             settings = AdamStep(lr, *self._betas, self._eps, int(state["step"]))
             assert parameter.grad is not None
             moments = state["exp_avg"], state["exp_avg_sq"]
-            adam_rows(parameter.detach(), parameter.grad, moments, settings, state.get(ROW_RATES))
+            rows, gradient = _rows_of(parameter.grad)
+            adam_rows(parameter.detach(), gradient, moments, settings, state.get(ROW_RATES), rows)
+
+
+def _rows_of(gradient: Tensor) -> tuple[Int[Tensor, " k"] | None, Tensor]:
+    """Rows that a sparse gradient of shape (*rows, c) has, each once and in the order of memory, and their values.
+
+    ``None`` for the rows of a dense one.
+    """
+    if not gradient.is_sparse:
+        return None, gradient
+    # Autograd forgets that a gradient which it keeps is coalesced; to find that out costs less than to sort it again.
+    rows = _flat(gradient._indices(), gradient.shape)
+    if bool((rows[1:] <= rows[:-1]).any()):
+        gradient = gradient.coalesce()
+        rows = _flat(gradient._indices(), gradient.shape)
+    return rows, gradient._values()
+
+
+def _flat(indices: Int[Tensor, "d k"], shape: torch.Size) -> Int[Tensor, " k"]:
+    """Indices of rows of an array of this shape, last axis excepted, in the order of memory."""
+    flat = indices[0]
+    for axis, size in zip(indices[1:], shape[1:-1], strict=True):
+        flat = flat * size + axis
+    return flat

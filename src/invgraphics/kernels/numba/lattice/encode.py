@@ -35,13 +35,14 @@ from invgraphics.kernels.numba.lattice.cells import (
 from invgraphics.kernels.numba.lattice.pairs import is_pair, multiply_pair
 from invgraphics.kernels.numba.lattice.positions import position_gradient
 from invgraphics.kernels.numba.lattice.rows import interpolate_block
+from invgraphics.kernels.numba.lattice.touched import sparse_rows, touched_rows
 from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, scratch, threads
 from invgraphics.kernels.numba.simd.partial import unowned
 
 MOST_ROWS = 2**32 - 1
 """Vertices and rows that 32 bits can number, one number aside for empty vertices."""
-
-
+LARGE = 32
+"""Numbers in a lattice, per corner of the points' cells, above which gradients of the rows there cost less than whole ones."""
 CORNERS_OF_TWO = (2, 0, 0)
 """Sizes of the forward pass's scratch: the corners of two lattices at a time."""
 
@@ -80,6 +81,7 @@ class _Shape:
 
     lattices: tuple[Lattice, ...]
     combine: Combination
+    sparse_gradients: bool
 
     def lattices_of(self, features: Sequence[Tensor]) -> list[Lattice]:
         """The lattices with these features."""
@@ -106,7 +108,9 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         unit, *features = ctx.saved_tensors
         wanted = (ctx.needs_input_grad[0], *ctx.needs_input_grad[2:])
-        found = iter(_Gradient.apply(unit, grad_outputs[0], ctx.shape, wanted, *features))
+        # A gradient that is differentiated again is dense.
+        shape = replace(ctx.shape, sparse_gradients=ctx.shape.sparse_gradients and not torch.is_grad_enabled())
+        found = iter(_Gradient.apply(unit, grad_outputs[0], shape, wanted, *features))
         grad_unit, *grad_features = [next(found) if want else None for want in wanted]
         return grad_unit, None, *grad_features
 
@@ -127,9 +131,7 @@ class _Gradient(torch.autograd.Function):
             position_gradient(positions, received, table, memory_of(sizes, jobs), sizes, jobs, grad_unit.numpy())
             found.append(grad_unit.T)
         if any(wanted[1:]):
-            grad_features = [torch.empty(x.shape) if want else None for x, want in zip(features, wanted[1:], strict=True)]
-            _feature_gradients(positions, received, table, grad_features)
-            found += [x for x in grad_features if x is not None]
+            found += _gradients(positions, received, shape, features, wanted[1:])
         return tuple(found)
 
     @staticmethod
@@ -146,6 +148,32 @@ class _Gradient(torch.autograd.Function):
             found = iter(torch.autograd.grad(first, asked, grad_outputs, allow_unused=True))
         grad_unit, grad_gradient, *grad_features = [next(found) if need else None for need in needed]
         return grad_unit, grad_gradient, None, None, *grad_features
+
+
+def _gradients(
+    positions: np.ndarray, gradient: np.ndarray, shape: _Shape, features: Sequence[Tensor], wanted: Sequence[bool]
+) -> list[Tensor]:
+    """Gradients of the wanted features; where these may be sparse, those of large lattices are."""
+    lattices = shape.lattices_of([values.detach() for values in features])
+    sparse = shape.sparse_gradients and shape.combine in ("concat", "sum")
+    chosen = {
+        k: touched_rows(positions, lattice, f"lattice.slots {k}")
+        for k, lattice in enumerate(lattices)
+        if sparse and wanted[k] and _is_large(lattice, positions.shape[1])
+    }
+    written = [chosen[k][0] if k in chosen else lattice for k, lattice in enumerate(lattices)]
+    out = [torch.empty(x.features.shape) if want else None for x, want in zip(written, wanted, strict=True)]
+    _feature_gradients(positions, gradient, records(written, shape.combine), out)
+    for k, (_, rows, unique) in chosen.items():
+        values = out[k]
+        assert values is not None
+        out[k] = sparse_rows(lattices[k], rows, values, unique)
+    return [tensor for tensor in out if tensor is not None]
+
+
+def _is_large(lattice: Lattice, points: int) -> bool:
+    """Whether a lattice has so many numbers that a gradient of the rows around so many points is cheaper than one of all."""
+    return 0 < LARGE * 2 ** len(lattice.axes) * points < lattice.features.numel()
 
 
 def _feature_gradients(positions: np.ndarray, gradient: np.ndarray, table: np.ndarray, out: Sequence[Tensor | None]) -> None:
@@ -166,12 +194,15 @@ def _feature_gradients(positions: np.ndarray, gradient: np.ndarray, table: np.nd
 
 
 def lattice_encode(
-    unit: Float[Tensor, "m 3"], lattices: Sequence[Lattice], combine: Combination = "concat"
+    unit: Float[Tensor, "m 3"],
+    lattices: Sequence[Lattice],
+    combine: Combination = "concat",
+    sparse_gradients: bool = False,
 ) -> Float[Tensor, "m width"]:
     """See `invgraphics.kernels.lattice_encode`; the derivative of its gradient is the reference's."""
     if any(max(math.prod(lattice.resolution), len(lattice.rows)) >= MOST_ROWS for lattice in lattices):
         return reference.lattice_encode(unit, lattices, combine)
-    shape = _Shape(tuple(_detached(lattice) for lattice in lattices), combine)
+    shape = _Shape(tuple(_detached(lattice) for lattice in lattices), combine, sparse_gradients)
     return _Encode.apply(unit, shape, *(lattice.features.contiguous() for lattice in lattices))
 
 
