@@ -81,13 +81,20 @@ def promised(speed_up: float, splat_share: float, step: float, hash_share: float
             measured(iterations.NERF_SHARE, "torch", BOTH, iterations.NERF_GATE, 0.1, amount=100.0),
             measured(iterations.NERF_STEP, "numba", BOTH, iterations.NERF_GATE, 0.2, amount=200.0 * rate_share),
             *samplers,
+            *(
+                measured(name, "numba", BOTH, lattice_cases.STEP.sizes(lattice_cases.STEP_POINTS), seconds)
+                for name, seconds in (
+                    (lattice_cases.WHOLE_STEP, 0.1 * lattice * lattice_cases.STEP_SPEED_UP),
+                    (lattice_cases.SPARSE_STEP, 0.1),
+                )
+            ),
         ]
     )
 
 
 def test_promises_kept_and_missed() -> None:
     kept = gates(promised(26, 0.07, 1.6, 0.5, 0.45, 1.1))
-    speed_ups = [1.1 * factor for factor in lattice_cases.SPEED_UPS.values()]
+    speed_ups = [1.1 * factor for factor in (*lattice_cases.SPEED_UPS.values(), lattice_cases.STEP_SPEED_UP)]
     assert [gate.verdict for gate in kept] == ["PASS"] * (6 + len(speed_ups))
     assert [gate.measured for gate in kept] == pytest.approx([26, 0.07, 0.07, 1.6, 0.5, 0.45, *speed_ups])
     assert [gate.verdict for gate in gates(promised(24, 0.05, 1.8, 0.3, 0.35, 0.9))] == ["MISS"] * len(kept)

@@ -6,7 +6,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 from invgraphics.bench import iterations, sample_cases, splat_cases
-from invgraphics.bench.lattice_cases import GATE_POINTS, LAYOUTS, SPEED_UPS, TORCH
+from invgraphics.bench.lattice_cases import (
+    GATE_POINTS,
+    LAYOUTS,
+    SPARSE_STEP,
+    SPEED_UPS,
+    STEP,
+    STEP_POINTS,
+    STEP_SPEED_UP,
+    TORCH,
+    WHOLE_STEP,
+)
 from invgraphics.bench.results import BOTH, PEERS, Results
 
 
@@ -45,6 +55,8 @@ def gates(results: Results) -> list[Gate]:
     drawing = results.find(iterations.SPLAT_SHARE, "numba", BOTH, **splat)
     whole = results.find(iterations.NERF_STEP, "numba", BOTH, **iterations.NERF_GATE)
     networks = results.find(iterations.NERF_SHARE, "torch", BOTH, **iterations.NERF_GATE)
+    at = STEP.sizes(STEP_POINTS)
+    whole_grid, rows = (results.find(name, "numba", BOTH, **at) for name in (WHOLE_STEP, SPARSE_STEP))
     size = f"{splat['gaussians'] // 1000}k Gaussians at {splat['width']} x {splat['width']}"
     return [
         Gate(
@@ -72,6 +84,10 @@ def gates(results: Results) -> list[Gate]:
             Gate(f"{name} forward and backward: times the speed of torch's grid_sample", "at least", promised, ratio)
             for name, promised in SPEED_UPS.items()
             for ratio in [_lattice_ratio(results, name)]
+        ),
+        Gate(
+            f"Step over {STEP.vertices}^3 vertices, sparse gradients: times the speed with whole ones",
+            "at least", STEP_SPEED_UP, whole_grid.timing.median / rows.timing.median if whole_grid and rows else None,
         ),
     ]  # fmt: skip
 

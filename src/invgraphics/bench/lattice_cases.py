@@ -1,4 +1,4 @@
-"""Benchmark cases of lattices: voxels, tri-planes and VM factors, each with the same work by torch's own grid sampler."""
+"""Benchmark cases of lattices: voxels, tri-planes and factors, each with the same work by torch's own grid sampler; steps."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
 from invgraphics import kernels
 from invgraphics.bench import limits
-from invgraphics.bench.case import Case, KernelPass, Run
+from invgraphics.bench.case import LARGE, Case, KernelPass, Run
 from invgraphics.bench.results import BOTH, FORWARD
 from invgraphics.bench.sample_cases import ray_ordered
 from invgraphics.bench.splat_cases import forward_backward, without_gradient
 from invgraphics.core.lattice import Combination, Lattice
+from invgraphics.training.optimisers.adam import MaskedAdam
 
 POINTS, QUICK_POINTS = (1 << 14, 1 << 16, 1 << 18), (1 << 14, 1 << 16)
 GATE_POINTS = 1 << 16
@@ -78,11 +79,35 @@ SPEED_UPS = {
 """Promised speed of forward and backward, as a multiple of torch's sampler; products do more work between look-ups."""
 
 
+STEP = Layout(("xyz",), "concat", 192, 12)
+"""Of a step's cases: DVGO's colours, finer than the paper's."""
+STEP_POINTS = 1 << 14
+WHOLE_STEP, SPARSE_STEP = "lattice step, whole gradient", "lattice step, sparse gradient"
+"""Names of a step's cases: encoding, its gradient and Adam on the entries that have one."""
+STEP_SPEED_UP = 5.0
+"""Promised speed of a step with sparse gradients, as a multiple of one with whole ones."""
+
+
 def lattice_encode(quick: bool) -> Iterator[Case]:
-    """Every layout over points."""
+    """Every layout over points, and steps of an optimiser with either kind of gradients."""
     for name, layout in LAYOUTS.items():
         for points in QUICK_POINTS if quick else POINTS:
             yield Case(name, layout.sizes(points), lambda layout=layout, points=points: _passes(layout, points))
+    for name, sparse in ((WHOLE_STEP, False), (SPARSE_STEP, True)):
+        yield Case(name, STEP.sizes(STEP_POINTS), lambda sparse=sparse: {BOTH: KernelPass(_step(sparse))}, LARGE)
+
+
+def _step(sparse: bool) -> Run:
+    """A step that follows the sum of all features."""
+    unit, parameter = ray_ordered(STEP_POINTS), nn.Parameter(STEP.lattices()[0].features.detach())
+    adam = MaskedAdam([{"params": [parameter], "lr": 0.1}], (0.9, 0.99), 1e-15)
+
+    def run() -> None:
+        adam.zero_grad()
+        kernels.lattice_encode(unit, [Lattice(parameter)], sparse_gradients=sparse).sum().backward()
+        adam.step()
+
+    return run
 
 
 def _passes(layout: Layout, points: int) -> dict[str, KernelPass]:
