@@ -47,6 +47,7 @@ from invgraphics.runs.provenance import LoadAverage, Options, Provenance
 from invgraphics.runs.schema import write_json
 from invgraphics.scenes.open import selection_notes, space_note
 from invgraphics.tables import read_json
+from invgraphics.text import duration
 from invgraphics.training.fit import Fit, Plan
 
 
@@ -179,7 +180,7 @@ def _prediction(job: Job, loaded: Scene, fit: Fit, memory: MemoryForecast) -> st
     """Forecast the fit's budget, memory and evaluation time in one sentence, before the fit starts; notes follow, on lines."""
     views = len(fit.plan.scene.test)
     seconds = expected_seconds(fit.plan.model, fit.plan.scene)
-    evaluation = f"{views} test views in at most about {seconds:.0f} s"
+    evaluation = f"{views} test views in at most about {duration(seconds)}"
     scene = fit.plan.scene
     advice = suggestion(job.method, scene)
     notes = selection_notes(scene) + space_note(loaded) + (f"\n  try also: {advice}" if advice else "")
