@@ -271,8 +271,8 @@ def allow_sparse_gradients(module: nn.Module, name: str, optimiser: Optimiser) -
         optimiser: of these parameters.
     """
     for path, part in module.named_modules(prefix=name):
-        if isinstance(part, SparseGradientModule) and isinstance(part, nn.Module):
-            names = [f"{path}.{key}" for key, parameter in part.named_parameters() if parameter.requires_grad]
+        names = [f"{path}.{key}" for key, parameter in part.named_parameters() if parameter.requires_grad]
+        if isinstance(part, SparseGradientModule):
             part.sparse_gradients = bool(names) and all(optimiser.skips_zero(key) for key in names)
 
 
