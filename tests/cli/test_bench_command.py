@@ -44,6 +44,11 @@ def made_up_run(request) -> Results:
             measured(f"{PEERS}: {name}", "numba", BOTH, sizes, 0.1),
             measured(f"{PEERS}: {name}", lattice_cases.TORCH, BOTH, sizes, 1.2),
         ]
+    at = lattice_cases.STEP.sizes(lattice_cases.STEP_POINTS)
+    results.measurements += [
+        measured(lattice_cases.WHOLE_STEP, "numba", BOTH, at, 0.6),
+        measured(lattice_cases.SPARSE_STEP, "numba", BOTH, at, 0.1),
+    ]
     results.skipped.append(Skipped("a peer", "it is not installed"))
     return results
 
@@ -78,7 +83,7 @@ def test_unknown_kernels_are_refused(capsys) -> None:
 def test_a_missed_promise_fails_only_a_check(tmp_path: Path, capsys) -> None:
     assert main.run(["bench", "--out", str(tmp_path)]) == main.DONE
     shown = capsys.readouterr().out
-    assert "9 of 10 promises kept, 1 missed." in shown and "left out: a peer (it is not installed)" in shown
+    assert "10 of 11 promises kept, 1 missed." in shown and "left out: a peer (it is not installed)" in shown
     assert main.run(["bench", "--out", str(tmp_path), "--check"]) == main.FAILED
 
 
@@ -86,8 +91,8 @@ def test_a_missed_promise_fails_only_a_check(tmp_path: Path, capsys) -> None:
 def test_the_page_is_whole_and_works_offline(tmp_path: Path) -> None:
     main.run(["bench", "--out", str(tmp_path)])
     html = (tmp_path / "index.html").read_text()
-    assert html.count(">PASS<") == 9 and html.count(">MISS<") == 1
-    assert "another&#39;s &lt;code&gt;" in html and "9 of 10 promises kept" in html
+    assert html.count(">PASS<") == 10 and html.count(">MISS<") == 1
+    assert "another&#39;s &lt;code&gt;" in html and "10 of 11 promises kept" in html
     sections = ("kernels", "steps", "growth", "threads", "memory", "peers", "limits", "machine")
     assert all(f'<section id="{name}">' in html and f'href="#{name}"' in html for name in sections)
     links = re.findall(r'(?:src|href)="([^"#]+)"', html)

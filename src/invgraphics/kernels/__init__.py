@@ -7,12 +7,10 @@ deterministic for a given number of threads, ``cuda`` accumulates some gradients
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from invgraphics.core import fused, lattice, ngp
+from invgraphics.core import ngp
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
@@ -24,6 +22,9 @@ from invgraphics.kernels.dispatch import in_use as in_use
 from invgraphics.kernels.dispatch import use as use
 from invgraphics.kernels.dispatch import using as using
 from invgraphics.kernels.dispatch import warm_up as warm_up
+from invgraphics.kernels.lattices import lattice_encode as lattice_encode
+from invgraphics.kernels.lattices import lattice_march as lattice_march
+from invgraphics.kernels.lattices import lattice_render as lattice_render
 from invgraphics.kernels.meshes import mesh_interpolate as mesh_interpolate
 from invgraphics.kernels.meshes import mesh_rasterise as mesh_rasterise
 from invgraphics.kernels.tracing import sdf_trace as sdf_trace
@@ -46,36 +47,6 @@ def hash_encode(
         and the Jacobian, differentiable in ``table``.
     """
     return choose("hash_encode", unit)(unit, table, grid, jacobian)
-
-
-def lattice_encode(
-    unit: Float[Tensor, "m 3"],
-    lattices: Sequence[lattice.Lattice],
-    combine: lattice.Combination = "concat",
-    sparse_gradients: bool = False,
-) -> Float[Tensor, "m width"]:
-    """Linear, bilinear and trilinear interpolation of features on lines, planes and voxel grids, combined per point.
-
-    Compiled for float32 on the CPU and on NVIDIA GPUs; elsewhere the reference runs.
-
-    Args:
-        unit: positions in [0, 1]; those outside are clamped, NaN counts as 0.
-        lattices: dense or linked lattices, features of ``unit``'s dtype and device.
-        combine: concatenation, sum, VM or CP product (see `core.lattice.Combination`).
-        sparse_gradients: allow gradients of features that are sparse tensors of the rows around the points, as torch's
-            ``embedding`` has them: their cost does not grow with the lattice. On the CPU, of large lattices that are not
-            factors of a product, unless the graph of the gradient is asked for; all others stay dense.
-
-    Returns:
-        Features, differentiable twice in ``unit`` and in every lattice's features; the gradient along axes on which a position
-        was clamped is zero. Widths: ``concat`` the sum of all channels, ``vm`` that of its pairs, ``sum`` and ``cp`` one
-        lattice's channels.
-
-    Raises:
-        InputError: lattices that do not fit together or do not fit the positions.
-    """
-    lattice.check_lattices(unit, lattices, combine)
-    return choose("lattice_encode", unit)(unit, lattices, combine, sparse_gradients)
 
 
 def adam_rows(
@@ -176,39 +147,6 @@ def ngp_render(
         Sums of w * (radiance, distance), and of w, per ray (see `composite`).
     """
     return choose("ngp_render", rays.origins)(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
-
-
-def lattice_march(
-    rays: Rays,
-    occupied: Bool[Tensor, "r r r"],
-    bounds: Bounds,
-    steps: types.MarchSteps,
-    field: fused.FusedLattice,
-    start: Float[Tensor, " n"],
-    min_transmittance: float,
-) -> types.March:
-    """`ngp_march` for a field over lattices.
-
-    Arguments and result as there; appearance and networks of colour are not looked at.
-    """
-    return choose("lattice_march", rays.origins)(rays, occupied, bounds, steps, field, start, min_transmittance)
-
-
-def lattice_render(
-    rays: Rays,
-    occupied: Bool[Tensor, "r r r"],
-    bounds: Bounds,
-    steps: types.MarchSteps,
-    field: fused.FusedLattice,
-    min_transmittance: float = 0.0,
-    max_error: float = 0.0,
-    width: int = 0,
-) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-    """`ngp_render` for a field over lattices: voxels, tri-planes, VM and CP factors, with networks or without.
-
-    Arguments and results as there. Not differentiable.
-    """
-    return choose("lattice_render", rays.origins)(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
 
 
 def composite(

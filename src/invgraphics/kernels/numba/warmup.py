@@ -32,6 +32,7 @@ from invgraphics.kernels.numba.ngp.render import ngp_render
 from invgraphics.kernels.numba.ngp.trace import sdf_trace
 from invgraphics.kernels.numba.rays.composite import composite
 from invgraphics.kernels.numba.rays.march import ray_march
+from invgraphics.kernels.numba.runtime import threads
 from invgraphics.kernels.numba.segments import segment_sums
 from invgraphics.kernels.numba.splat.binning import splat_bin
 from invgraphics.kernels.numba.splat.project import splat_project
@@ -81,17 +82,18 @@ def samples() -> None:
     near_points(torch.zeros(1, 3), torch.zeros(1, 3), 1, 1.0)
     rows, weights = torch.ones(1, 2).requires_grad_(), torch.ones(1).requires_grad_()
     segment_sums(rows, weights, torch.zeros(1, dtype=torch.int64), 1).sum().backward()
-    unit = torch.full((2, 3), 0.4).requires_grad_()
+    unit = torch.full((2 * threads(), 3), 0.4).requires_grad_()
     levels = HashGrid(levels=2, log2_size=4, base=1, finest=4)
     features, _ = hash_encode(unit, torch.zeros(levels.entries, 2).requires_grad_(), levels)
     scaled = features * torch.ones_like(features).requires_grad_()  # so that second derivatives meet both kernels
     (gradient,) = torch.autograd.grad(scaled.sum(), unit, create_graph=True)
-    factors = [Lattice(torch.zeros(2, 1).requires_grad_(), axis) for axis in "xy"]
+    # Several threads add up copies of the first one's gradient, and share the rows of the second one.
+    factors = [Lattice(torch.zeros(rows, 1).requires_grad_(), axis) for rows, axis in ((2, "x"), (len(unit), "y"))]
     values = lattice_encode(unit, factors, "cp")
     touched_rows(unit.detach().T.contiguous().numpy(), Lattice(torch.zeros(2, 2, 2, 1)), "lattice.slots")
     rows = [torch.ones(2, 1) for _ in range(4)]
     adam_rows(rows[0], rows[1], (rows[2], rows[3]), AdamStep(0.1, 0.9, 0.99, 1e-15, 1), torch.ones(2))
-    ray = torch.zeros(2, dtype=torch.int64)
+    ray = torch.zeros(len(unit), dtype=torch.int64)
     _, sums, alpha = composite(values[:, 0], features, ray, 1)
     (sums.sum() + alpha.sum() + gradient.sum()).backward()
     bounds = Bounds(torch.zeros(3), torch.ones(3))
