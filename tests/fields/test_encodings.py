@@ -1,15 +1,21 @@
 """Frequency and hash encodings against closed forms and finite differences."""
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
 
 from invgraphics import kernels
 from invgraphics.config import fill, to_table
+from invgraphics.core import Camera
 from invgraphics.errors import InputError
+from invgraphics.fields.density_field import DensityFieldConfig
 from invgraphics.fields.encodings.frequency import FrequencyConfig
 from invgraphics.fields.encodings.hash import HashConfig
+from invgraphics.fields.neural import NeuralFieldConfig
+from invgraphics.testing import toy_scene
 
 
 @pytest.mark.parametrize("include", [True, False])
@@ -54,6 +60,37 @@ def test_hash_gradients_of_both_orders():
         return slope.norm(dim=1)
 
     assert torch.autograd.gradcheck(steepness, (encoding.table,))
+
+
+def test_a_hash_grid_ends_at_the_pixels():
+    """Never finer than asked for nor than pixels, never coarser than its base, and as gradual as before."""
+    grid = HashConfig(levels=10, base=16, finest=1024)
+    assert grid.resolved(115.0) == grid
+    for spacing, pixels in ((1.0, 115.0), (2.0, 115.0), (0.5, 301.7), (1.0, 1023.0), (1.0, 17.0)):
+        limited = replace(grid, min_spacing=spacing).resolved(pixels)
+        assert limited.resolutions[0] == 16 and limited.resolutions[-1] == limited.finest == int(pixels / spacing)
+        growths = [fine / coarse for coarse, fine in pairwise(limited.resolutions)]
+        assert max(growths) <= 64 ** (1 / 9) + 1 / 16 and limited.levels < 11
+    assert replace(grid, min_spacing=1.0).resolved(10.0).resolutions == (16,)
+    assert replace(grid, min_spacing=1.0).resolved(1024.0).resolutions == grid.resolutions
+    one = HashConfig(levels=1, base=16, finest=16, min_spacing=1.0)
+    assert one.resolved(10.0) == one
+
+
+@pytest.mark.parametrize("slot", ["field", "renderer.sampler.fields"])
+def test_grids_of_fields_have_cells_of_a_pixel(slot):
+    """A camera at distance d with focal length f sees a box of edge e as e f / d pixels; without views there is no limit."""
+    scene = toy_scene(views=1, size=4)
+    pose = torch.eye(4)
+    pose[2, 3] = -400.0
+    far = Camera(pose, torch.tensor([8000.0, 8000.0]), torch.tensor([2.0, 2.0]), 4, 4)
+    scene = replace(scene, train=(replace(scene.train[0], camera=far),))
+    grid = HashConfig(levels=4, log2_size=10, base=8, finest=512, min_spacing=0.5)
+    config = NeuralFieldConfig(grid, appearance=grid) if slot == "field" else DensityFieldConfig(grid)
+    field = config.build(scene)
+    for encoding in (field.encoding, getattr(field, "appearance", None)):
+        assert encoding is None or encoding.grid.finest == pytest.approx(2 * 8000 / 400 / 0.5, rel=0.01)
+    assert config.build(replace(scene, train=())).encoding.grid.finest == 512
 
 
 def test_same_seed_same_table():

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from invgraphics.core import Bounds, Context, Field, FieldValues, Quantity, Rays, Samples
+from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Quantity, Rays, Samples
 from invgraphics.fields.analytic import Sphere
 from invgraphics.renderers.distance_density import LaplaceDensity, LogisticDensity, laplace_density, neighbour_slopes
 from invgraphics.renderers.hybrid import Hybrid
@@ -236,6 +236,37 @@ def test_what_becomes_of_the_width(make):
         assert float(stand_in.beta(ctx).detach()) == pytest.approx(2 * constant, rel=1e-3)
         stand_in.load_state_dict(renderer.state_dict())
         assert float(stand_in.beta(ctx).detach()) == pytest.approx(2 * now, rel=1e-3)
+
+
+@pytest.mark.parametrize("make", ["volsdf", "neus"])
+def test_a_schedule_ends_at_the_width_of_pixels(make):
+    """The distribution behind a density deviates by a given share of a pixel, by quadrature; sharper it gets on no schedule."""
+    scene = toy_scene(views=2, size=4)
+    pose = torch.eye(4)
+    pose[2, 3] = -400.0
+    far = Camera(pose, torch.tensor([5000.0, 5000.0]), torch.tensor([2.0, 2.0]), 4, 4)
+    scene = replace(scene, train=(replace(scene.train[0], camera=far),), bounds=Bounds(-torch.ones(3), torch.ones(3) * 2.0))
+    config, sharp = (VolSDFConfig, {"beta_final": 2e-4}) if make == "volsdf" else (NeuSConfig, {"sharpness_final": 1e4})
+    wide = {"beta": 0.2, "beta_final": 0.2} if make == "volsdf" else {"sharpness": 5.0, "sharpness_final": 5.0}
+
+    def deviation(**settings) -> float:
+        renderer = config(StratifiedConfig(8), **settings).build(scene)
+        ctx = Context(scene.bounds, training=True, progress=1.0)
+        renderer.update(Sphere(1.0, 0.5), ctx)
+        sdf, width = torch.linspace(-9, 9, 1_000_001, dtype=torch.float64), renderer.beta(ctx).detach().double()
+        cdf = laplace_density(-sdf, width) * width if make == "volsdf" else torch.sigmoid(sdf / width)
+        return float((cdf.diff() * ((sdf[1:] + sdf[:-1]) / 2).square()).sum().sqrt())
+
+    pixel = 400.0 / 5000.0
+    for share in (0.3, 0.6):
+        found = deviation(**sharp, change="scheduled", min_deviation=share)
+        assert found == pytest.approx(share * pixel, rel=0.01)
+    assert deviation(**sharp, change="scheduled") < 0.03 * pixel
+    assert deviation(**wide, change="scheduled", min_deviation=0.3) > pixel  # as wide as it was asked for
+    start = {"beta": 0.001} if make == "volsdf" else {"sharpness": 1000.0}
+    assert deviation(**start, change="held", min_deviation=0.3) < 0.1 * pixel
+    with pytest.raises(ValueError, match="min_deviation"):
+        config(min_deviation=-1.0)
 
 
 @pytest.mark.parametrize("config", [VolSDFConfig, NeuSConfig])

@@ -14,7 +14,7 @@ from invgraphics.renderers.splatting import SplattingConfig
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
-from invgraphics.training.limits import COLLAPSED, LimitsConfig, dead_gaussians, pixel_sizes
+from invgraphics.training.limits import COLLAPSED, LimitsConfig, dead_gaussians
 from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
 
@@ -118,13 +118,6 @@ def test_limits_survive_an_interruption_bit_by_bit() -> None:
         second.step()
     for name in PARAMETERS:
         assert torch.equal(getattr(whole.plan.model.field, name), getattr(second.plan.model.field, name)), name
-
-
-def test_pixel_sizes_are_distances_over_focal_lengths_of_the_nearest_camera() -> None:
-    """Two cameras at y = -4 and y = 4 with focal length 40 px; a point beside one of them, out of its sight, counts too."""
-    cameras = [view.camera for view in _scene().train]
-    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0], [3.0, 4.0, 0.0]])
-    torch.testing.assert_close(pixel_sizes(points, cameras), torch.tensor([4.0, 3.0, 3.0]) / 40)
 
 
 def test_causes_are_told_apart() -> None:

@@ -1,14 +1,14 @@
 """Up-sampling: the function stays, the optimiser follows as the recipe says, and a fit resumes across it to the bit."""
 
-from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from invgraphics.core import Bounds, Camera, Quantity, Samples
+from invgraphics.core import Quantity, Samples
 from invgraphics.core.lattice import resampled, vertices_along
+from invgraphics.core.resolution import pixel_limit
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, build_plan
 from invgraphics.recipes.recipe import load_method, resolve
@@ -18,7 +18,7 @@ from invgraphics.training.fit import Fit
 from invgraphics.training.hooks import FitState
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 from invgraphics.training.optimisers.muon import DECAY, MOMENTUM
-from invgraphics.training.upsample import Upsample, UpsampleConfig, pixel_limit
+from invgraphics.training.upsample import Upsample, UpsampleConfig
 
 ENCODINGS = {
     "voxels": {"type": "voxels", "resolution": 7, "features": 4, "spread": 0.5},
@@ -104,19 +104,6 @@ def test_counts_grow_log_linearly_or_as_listed(scene):
     assert grown == [7, 7, 14, 14, 28, 28, 56, 56, 56, 56]
     listed = sizes(fit_of(scene, "voxels", 5, at=[0.2, 0.6], resolutions=[9, 8]), 5)
     assert listed == [7, 9, 9, 8, 8]
-
-
-def test_vertices_are_never_closer_than_the_pixels_of_the_nearest_camera():
-    """A box of 2 x 2 x 4 far from two cameras: a pixel is the distance over the focal length of the nearer one."""
-    far = []
-    for distance in (400.0, 900.0):
-        pose = torch.eye(4)
-        pose[2, 3] = -distance
-        far.append(Camera(pose, torch.tensor([5000.0, 5000.0]), torch.tensor([50.0, 50.0]), 100, 100))
-    bounds = Bounds(torch.tensor([-1.0, -1.0, -2.0]), torch.tensor([1.0, 1.0, 2.0]))
-    expected = 16 ** (1 / 3) * 5000.0 / 400.0
-    assert pixel_limit(bounds, far) == pytest.approx(expected, rel=0.01)
-    assert pixel_limit(replace(bounds, space="contracted"), far) == pytest.approx(2 * expected, rel=0.01)
 
 
 def test_growth_ends_at_the_pixels(scene):

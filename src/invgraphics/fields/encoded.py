@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.field import Encoding
+from invgraphics.core.resolution import pixel_limit
 from invgraphics.core.samples import Samples
+from invgraphics.core.scene import Scene
+from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.encodings.lattices import LatticeConfig
+
+Config = TypeVar("Config", bound=Any)
+
+
+def resolved(config: Config, scene: Scene) -> Config:
+    """A field's config for a scene: hash grids with a ``min_spacing`` end at the pixels of the training views."""
+    grids = {name: grid for name in ("encoding", "appearance") if isinstance(grid := getattr(config, name, None), HashConfig)}
+    if not (scene.train and any(grid.min_spacing for grid in grids.values())):
+        return config
+    pixels = pixel_limit(scene.bounds, [view.camera for view in scene.train])
+    return replace(config, **{name: grid.resolved(pixels) for name, grid in grids.items()})
 
 
 def build_encoding(config: Any, bounds: Bounds) -> Encoding:

@@ -31,6 +31,8 @@ _ADDED_TO_NEURAL = {
     "colour_activation": "sigmoid",
     "colour_padding": 0.0,
 }
+_ADDED_TO_HASH = {"min_spacing": 0.0}
+
 ADDED_KEYS: dict[str, dict[str, Any]] = {
     "field.neural": _ADDED_TO_NEURAL,
     "hooks.density_control": {"reset_spacing": 0, "split_threshold": 0.0},
@@ -39,7 +41,13 @@ ADDED_KEYS: dict[str, dict[str, Any]] = {
     "field.gaussians": {"dropout": 0.0, "dropout_views": 0},
     "renderer.sampler.proposal.neural": _ADDED_TO_NEURAL,
     "renderer.sampler.proposals": {"anneal_until": 1.0},
+    "field.encoding.hash": _ADDED_TO_HASH,
+    "field.appearance.hash": _ADDED_TO_HASH,
+    "renderer.sampler.fields.encoding.hash": _ADDED_TO_HASH,
+    "renderer.sampler.proposal.encoding.hash": _ADDED_TO_HASH,
     "renderer.volumetric": {"colour_threshold": 0.0},
+    "renderer.volsdf": {"min_deviation": 0.0},
+    "renderer.neus": {"min_deviation": 0.0},
     "batches": {"foreground_until": 1.0, "foreground_least": 0.0, "start_size": 0, "start_until": 0.5},
 }
 """Part of a recipe -> keys that later versions added, with the values that change nothing."""

@@ -21,8 +21,10 @@ from invgraphics.core import (
     Rendering,
     Sampler,
     Samples,
+    Scene,
     Trace,
 )
+from invgraphics.core.resolution import pixel_size
 from invgraphics.renderers.distance_density import DistanceDensity
 from invgraphics.renderers.quadrature import heaviest_of_rays, sample_weights
 from invgraphics.renderers.volumetric import Volumetric
@@ -158,7 +160,20 @@ def make_volumetric(sampler: Sampler, gradient_reach: float, weight_threshold: f
     return Volumetric(WeightThresholdSampler(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
 
 
-def check_settings(first: float, last: float, gradient_reach: float, weight_threshold: float) -> None:
+def least_deviation(min_deviation: float, scene: Scene) -> float:
+    """Standard deviation of a density's distribution that pictures resolve, in half-extents of the box; 0 without views.
+
+    Args:
+        min_deviation: the same in pixels of the nearest training camera (see `pixel_size`).
+        scene: with training views.
+    """
+    if not (min_deviation and scene.train):
+        return 0.0
+    size = pixel_size(scene.bounds, [view.camera for view in scene.train])
+    return min_deviation * size / float(scene.bounds.half.mean())
+
+
+def check_settings(first: float, last: float, min_deviation: float, gradient_reach: float, weight_threshold: float) -> None:
     """Check settings that all renderers of this family have.
 
     Raises:
@@ -166,6 +181,8 @@ def check_settings(first: float, last: float, gradient_reach: float, weight_thre
     """
     if min(first, last) <= 0:
         raise ValueError("the width of a density, or its sharpness, must be above 0.")
+    if min_deviation < 0:
+        raise ValueError(f"min_deviation must not be negative, not {min_deviation}")
     if gradient_reach < 0:
         raise ValueError(f"gradient_reach must not be negative, not {gradient_reach}")
     if not 0 <= weight_threshold < 1:

@@ -13,10 +13,12 @@ from typing_extensions import override
 from invgraphics.config import Slot
 from invgraphics.core import Context, Field, Quantity, Scene
 from invgraphics.renderers.distance_density import LogisticDensity
-from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, make_volumetric
+from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, least_deviation, make_volumetric
 from invgraphics.renderers.up_sampling import UpSamplingConfig
 from invgraphics.renderers.volumetric import Volumetric
 
+DEVIATION = math.pi / math.sqrt(3)
+"""Standard deviation of the logistic distribution, times s."""
 EXPONENT = 10.0
 """The parameter of s is v = log(s) / 10 (NeuS, its code): a step of the optimiser multiplies s."""
 
@@ -30,6 +32,8 @@ class NeuSConfig:
         sharpness: s of the logistic distribution at the start, per half-extent of the box (NeuS: exp(3) = 20).
         sharpness_final: s at the end where it is scheduled; stands in for a learnt one that the field was not fitted with.
         change: whether s is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
+        min_deviation: least standard deviation of the density's distribution on a schedule, in pixels of the nearest training
+            camera over the box (1/√12: that of a pixel's own box); pictures show no sharper edge. 0: none.
         anneal: progress until which rays see surfaces that they leave too, less and less (NeuS without masks: 1/6).
         gradient_reach: as of volume rendering.
         weight_threshold: in training, samples that weigh no more than this by the sampler's own densities, where it
@@ -42,12 +46,13 @@ class NeuSConfig:
     sharpness: float = 20.0
     sharpness_final: float = 1000.0
     change: Change = "learnt"
+    min_deviation: float = 0.0
     anneal: float = 0.0
     gradient_reach: float = 0.0
     weight_threshold: float = 0.0
 
     def __post_init__(self) -> None:
-        check_settings(self.sharpness, self.sharpness_final, self.gradient_reach, self.weight_threshold)
+        check_settings(self.sharpness, self.sharpness_final, self.min_deviation, self.gradient_reach, self.weight_threshold)
         if not 0 <= self.anneal <= 1:
             raise ValueError(f"anneal must be in [0, 1], not {self.anneal}")
 
@@ -66,7 +71,16 @@ class NeuSConfig:
 
     def build(self, scene: Scene) -> NeuS:
         """The renderer with its sampler."""
-        return NeuS(self, make_volumetric(self.sampler.build(scene), self.gradient_reach, self.weight_threshold))
+        volumetric = make_volumetric(self.sampler.build(scene), self.gradient_reach, self.weight_threshold)
+        return NeuS(self._resolved(scene), volumetric)
+
+    def _resolved(self, scene: Scene) -> NeuSConfig:
+        """The settings with a schedule that stays as wide as ``min_deviation``."""
+        least = least_deviation(self.min_deviation, scene)
+        if self.change != "scheduled" or not least:
+            return self
+        most = DEVIATION / least
+        return replace(self, sharpness=min(self.sharpness, most), sharpness_final=min(self.sharpness_final, most))
 
 
 class NeuS(Hybrid):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar
 
@@ -13,8 +14,11 @@ from invgraphics.config import Slot
 from invgraphics.core import Context, Field, Quantity, Scene
 from invgraphics.renderers.distance_density import LaplaceDensity
 from invgraphics.renderers.error_bounded import ErrorBoundedConfig
-from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, make_volumetric
+from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, least_deviation, make_volumetric
 from invgraphics.renderers.volumetric import Volumetric
+
+DEVIATION = math.sqrt(2)
+"""Standard deviation of Laplace's distribution, over β."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,8 @@ class VolSDFConfig:
         beta: β, the width of the density at the start, in half-extents of the box.
         beta_final: β at the end where it is scheduled; stands in for a learnt one that the field was not fitted with.
         beta_min: least β (VolSDF: 1e-4).
+        min_deviation: least standard deviation of the density's distribution on a schedule, in pixels of the nearest training
+            camera over the box (1/√12: that of a pixel's own box); pictures show no sharper edge. 0: none.
         change: whether β is ``learnt``, ``scheduled`` log-linearly over the fit, or ``held``.
         sections: take the density's mean over each interval, along which the SDF is assumed linear, instead of the density at
             its middle (VolSDF: at its start): for even steps, which are longer than a small β.
@@ -40,13 +46,14 @@ class VolSDFConfig:
     beta: float = 0.1
     beta_final: float = 0.002
     beta_min: float = 1e-4
+    min_deviation: float = 0.0
     change: Change = "learnt"
     sections: bool = False
     gradient_reach: float = 0.0
     weight_threshold: float = 0.0
 
     def __post_init__(self) -> None:
-        check_settings(self.beta, self.beta_final, self.gradient_reach, self.weight_threshold)
+        check_settings(self.beta, self.beta_final, self.min_deviation, self.gradient_reach, self.weight_threshold)
         if not 0 < self.beta_min <= min(self.beta, self.beta_final):
             raise ValueError("beta_min must be above 0, and at most beta and beta_final.")
 
@@ -65,7 +72,15 @@ class VolSDFConfig:
 
     def build(self, scene: Scene) -> VolSDF:
         """The renderer with its sampler."""
-        return VolSDF(self, make_volumetric(self.sampler.build(scene), self.gradient_reach, self.weight_threshold))
+        volumetric = make_volumetric(self.sampler.build(scene), self.gradient_reach, self.weight_threshold)
+        return VolSDF(self._resolved(scene), volumetric)
+
+    def _resolved(self, scene: Scene) -> VolSDFConfig:
+        """The settings with a schedule that stays as wide as ``min_deviation``."""
+        least = least_deviation(self.min_deviation, scene) / DEVIATION
+        if self.change != "scheduled":
+            return self
+        return replace(self, beta=max(self.beta, least), beta_final=max(self.beta_final, least))
 
 
 class VolSDF(Hybrid):

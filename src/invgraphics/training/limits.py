@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Camera, Field
+from invgraphics.core.resolution import pixel_sizes
 from invgraphics.kernels.types import ALPHA_MIN
 from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters
 from invgraphics.training.hooks import FitState, Hook
@@ -24,8 +25,6 @@ COLLAPSED = 1e-4
 square is lost beside the low-pass filter's 0.3 px² in float32."""
 SMALLEST = 1e-12
 """Scale limit, local units, of a Gaussian at a camera's very position."""
-CHUNK = 1 << 15
-"""Points whose distances to all cameras are held at once."""
 
 
 @dataclass(frozen=True)
@@ -91,23 +90,6 @@ class Limits(Hook):
 
 def _logit(opacity: float) -> float:
     return math.log(opacity / (1 - opacity))
-
-
-def pixel_sizes(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
-    """Size of a pixel at each point, local units: the smallest distance over focal length of any camera, in view or not.
-
-    A lower bound of what any of the cameras can resolve there, from distances alone.
-    """
-    position = torch.stack([camera.position for camera in cameras]).to(points)
-    focal = torch.stack([camera.focal.max() for camera in cameras]).to(points)
-    sizes = [_nearest(part, position, focal) for part in points.split(CHUNK)]
-    return torch.cat(sizes) if sizes else points[:, 0]
-
-
-def _nearest(points: Float[Tensor, "k 3"], position: Float[Tensor, "c 3"], focal: Float[Tensor, " c"]) -> Float[Tensor, " k"]:
-    """Smallest distance over focal length, by |p - c|² = |p|² - 2 p·c + |c|²."""
-    squared = points.square().sum(dim=1, keepdim=True) - 2 * points @ position.T + position.square().sum(dim=1)
-    return (squared.clamp_min(0.0) / focal.square()).amin(dim=1).sqrt()
 
 
 DEAD_SHARE = 0.01

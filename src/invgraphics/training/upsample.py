@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, cast
@@ -12,11 +12,11 @@ import torch
 from torch import nn
 from typing_extensions import override
 
-from invgraphics.core import Bounds, Camera, Field, Renderer
+from invgraphics.core import Field, Renderer
 from invgraphics.core.lattice import LatticeEncoding, LatticeField, resampled, vertices_along
+from invgraphics.core.resolution import pixel_limit
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
-from invgraphics.training.limits import pixel_sizes
 from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.penalties import LATTICES
 
@@ -105,17 +105,6 @@ class Upsample(MilestoneHook):
 
 
 @torch.no_grad()
-def pixel_limit(bounds: Bounds, cameras: Sequence[Camera]) -> float:
-    """Vertices along the edge of a cubic lattice that are a pixel of the nearest camera apart: the median over the box.
-
-    In contracted space the box has half of the lattice's edge.
-    """
-    axis = torch.linspace(-1, 1, 8)
-    points = bounds.centre + torch.cartesian_prod(axis, axis, axis).to(bounds.half) * bounds.half
-    edge = float((2 * bounds.half).prod()) ** (1 / 3) * (2 if bounds.space == "contracted" else 1)
-    return edge / float(pixel_sizes(points, cameras).median())
-
-
 def _resize(sizes: list[tuple[LatticeEncoding, float]], edges: list[float]) -> None:
     for encoding, resolution in sizes:
         encoding.resize(vertices_along(resolution, edges))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -22,17 +23,37 @@ COARSE_LEVELS = 2
 
 @dataclass(frozen=True)
 class HashConfig(HashGrid):
-    """A hash grid as a recipe's encoding: `HashGrid` with its limits."""
+    """A hash grid as a recipe's encoding: `HashGrid` with its limits.
+
+    Attributes:
+        min_spacing: smallest cell, in pixels of the nearest training camera (`pixel_limit`): levels that pictures do not
+            resolve overfit, and cost time. 0: no limit.
+    """
 
     title: ClassVar[str] = "multi-resolution hash grid"
 
+    min_spacing: float = 0.0
+
     def __post_init__(self) -> None:
+        if self.min_spacing < 0:
+            raise ValueError(f"min_spacing must not be negative, not {self.min_spacing}.")
         if not 1 <= self.levels <= MAX_LEVELS or self.features < 1:
             raise ValueError(f"levels must be from 1 to {MAX_LEVELS}, features at least 1.")
         if not 1 <= self.log2_size <= 30:
             raise ValueError(f"log2_size must be from 1 to 30, not {self.log2_size}.")
         if not 1 <= self.base <= self.finest < 2**20:
             raise ValueError(f"1 <= base <= finest < 2^20 must hold, not base = {self.base} and finest = {self.finest}.")
+
+    def resolved(self, pixels: float) -> HashConfig:
+        """The grid with no cells smaller than ``min_spacing``, where ``pixels`` along an edge are resolved.
+
+        Its finest level is at that limit, the others grow by about the same factor as before.
+        """
+        if self.base == self.finest or self.finest * self.min_spacing <= pixels:
+            return self
+        finest = max(self.base, int(pixels / self.min_spacing))
+        steps = (self.levels - 1) * math.log(finest / self.base) / math.log(self.finest / self.base)
+        return replace(self, levels=1 + math.ceil(steps), finest=finest)
 
     def build(self) -> HashEncoding:
         """The encoding, its table drawn from torch's global generator."""
