@@ -7,8 +7,8 @@ import torch
 from torch.nn.functional import interpolate
 
 from invgraphics.core import Quantity, Samples
+from invgraphics.core.camera import pixel_limit
 from invgraphics.core.lattice import resampled, vertices_along
-from invgraphics.core.resolution import pixel_limit
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, build_plan
 from invgraphics.recipes.recipe import load_method, resolve

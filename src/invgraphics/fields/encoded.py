@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
+from invgraphics.core.camera import pixel_limit
 from invgraphics.core.field import Encoding
-from invgraphics.core.resolution import pixel_limit
 from invgraphics.core.samples import Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields.encodings.hash import HashConfig

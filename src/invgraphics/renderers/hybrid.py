@@ -24,7 +24,7 @@ from invgraphics.core import (
     Scene,
     Trace,
 )
-from invgraphics.core.resolution import pixel_size
+from invgraphics.core.camera import pixel_size
 from invgraphics.renderers.distance_density import DistanceDensity
 from invgraphics.renderers.quadrature import heaviest_of_rays, sample_weights
 from invgraphics.renderers.volumetric import Volumetric

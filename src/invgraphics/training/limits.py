@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Camera, Field
-from invgraphics.core.resolution import pixel_sizes
+from invgraphics.core.camera import pixel_sizes
 from invgraphics.kernels.types import ALPHA_MIN
 from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters
 from invgraphics.training.hooks import FitState, Hook

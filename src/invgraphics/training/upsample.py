@@ -13,8 +13,8 @@ from torch import nn
 from typing_extensions import override
 
 from invgraphics.core import Field, Renderer
+from invgraphics.core.camera import pixel_limit
 from invgraphics.core.lattice import LatticeEncoding, LatticeField, resampled, vertices_along
-from invgraphics.core.resolution import pixel_limit
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook, check_milestones

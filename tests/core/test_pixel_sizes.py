@@ -1,4 +1,4 @@
-"""What pictures resolve in space: sizes of pixels, against distances over focal lengths."""
+"""Sizes of pixels in space, against distances over focal lengths."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from invgraphics.core import Bounds, Camera
-from invgraphics.core.resolution import pixel_limit, pixel_sizes
+from invgraphics.core.camera import pixel_limit, pixel_sizes
 
 
 def camera(position: tuple[float, float, float], focal: float) -> Camera:
