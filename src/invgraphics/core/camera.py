@@ -146,6 +146,7 @@ def _nearest(points: Float[Tensor, "k 3"], position: Float[Tensor, "c 3"], focal
     return (squared.clamp_min(0.0) / focal.square()).amin(dim=1).sqrt()
 
 
+@torch.no_grad()
 def pixel_size(bounds: Bounds, cameras: Sequence[Camera]) -> float:
     """Median over the bounds' box of `pixel_sizes`, local units."""
     axis = torch.linspace(-1, 1, 8)

@@ -15,7 +15,7 @@ from invgraphics.core.field import Field, Quantity
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields.density import Activation, DensityActivation
-from invgraphics.fields.encoded import build_encoding, encode_samples, resolved
+from invgraphics.fields.encoded import build_encoding, encode_samples, resolve_encodings
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.geometry import chunks
 from invgraphics.fields.mlp import Mlp
@@ -51,7 +51,7 @@ class DensityFieldConfig:
 
     def build(self, scene: Scene) -> DensityField:
         """Build the field for ``scene``'s bounds, its weights drawn from torch's global generator."""
-        return DensityField(resolved(self, scene), scene.bounds)
+        return DensityField(resolve_encodings(self, scene), scene.bounds)
 
 
 class DensityField(Field):

@@ -19,7 +19,7 @@ from invgraphics.fields.encodings.lattices import LatticeConfig
 Config = TypeVar("Config", bound=Any)
 
 
-def resolved(config: Config, scene: Scene) -> Config:
+def resolve_encodings(config: Config, scene: Scene) -> Config:
     """A field's config for a scene: hash grids with a ``min_spacing`` end at the pixels of the training views."""
     grids = {name: grid for name in ("encoding", "appearance") if isinstance(grid := getattr(config, name, None), HashConfig)}
     if not (scene.train and any(grid.min_spacing for grid in grids.values())):

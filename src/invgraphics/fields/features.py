@@ -14,7 +14,7 @@ from invgraphics.core.bounds import Bounds, Space
 from invgraphics.core.field import Field, Quantity
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
-from invgraphics.fields.encoded import build_encoding, encode_samples, resolved
+from invgraphics.fields.encoded import build_encoding, encode_samples, resolve_encodings
 from invgraphics.fields.encodings.frequency import FrequencyConfig
 
 
@@ -42,7 +42,7 @@ class FeatureFieldConfig:
 
     def build(self, scene: Scene) -> FeatureField:
         """Build the field for ``scene``'s bounds, its weights drawn from torch's global generator."""
-        return FeatureField(resolved(self, scene), scene.bounds)
+        return FeatureField(resolve_encodings(self, scene), scene.bounds)
 
 
 class FeatureField(Field):

@@ -31,7 +31,7 @@ from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.fields import heads
 from invgraphics.fields.density import DensityActivation
-from invgraphics.fields.encoded import build_encoding, encode_samples, resolved
+from invgraphics.fields.encoded import build_encoding, encode_samples, resolve_encodings
 from invgraphics.fields.encodings.lattices import LatticeFeatures, crop_lattices
 from invgraphics.fields.fused import FieldParts, fused_parts, sdf_parts
 from invgraphics.fields.geometry import chunks, query_geometry
@@ -57,7 +57,7 @@ class NeuralFieldConfig(NeuralSettings):
 
     def build(self, scene: Scene) -> NeuralField:
         """Build the field for ``scene``'s bounds and colour space, its weights drawn from torch's global generator."""
-        return NeuralField(resolved(self, scene), scene.bounds, scene.colour, interior=scene.is_interior)
+        return NeuralField(resolve_encodings(self, scene), scene.bounds, scene.colour, interior=scene.is_interior)
 
 
 class NeuralField(Field):

@@ -42,6 +42,11 @@ class HybridSettings(Protocol):
         ...
 
     @property
+    def min_deviation(self) -> float:
+        """Least standard deviation of the density's distribution on a schedule, in pixels."""
+        ...
+
+    @property
     def widths(self) -> tuple[float, float]:
         """The density's width at the start, and the one at the end or in an untrained renderer, in half-extents of the box."""
         ...
@@ -160,17 +165,18 @@ def make_volumetric(sampler: Sampler, gradient_reach: float, weight_threshold: f
     return Volumetric(WeightThresholdSampler(sampler, weight_threshold) if weight_threshold > 0 else sampler, gradient_reach)
 
 
-def least_deviation(min_deviation: float, scene: Scene) -> float:
-    """Standard deviation of a density's distribution that pictures resolve, in half-extents of the box; 0 without views.
+def least_width(settings: HybridSettings, deviation: float, scene: Scene) -> float:
+    """Width that a schedule does not go below, in half-extents of the box; 0 without a schedule, a limit or training views.
 
     Args:
-        min_deviation: the same in pixels of the nearest training camera (see `pixel_size`).
-        scene: with training views.
+        settings: with the least standard deviation in pixels of the nearest training camera (`pixel_size`).
+        deviation: standard deviation of the density's distribution, over its width.
+        scene: whose training views resolve these pixels.
     """
-    if not (min_deviation and scene.train):
+    if settings.change != "scheduled" or not settings.min_deviation or not scene.train:
         return 0.0
     size = pixel_size(scene.bounds, [view.camera for view in scene.train])
-    return min_deviation * size / float(scene.bounds.half.mean())
+    return settings.min_deviation * size / float(scene.bounds.half.mean()) / deviation
 
 
 def check_settings(first: float, last: float, min_deviation: float, gradient_reach: float, weight_threshold: float) -> None:

@@ -13,12 +13,12 @@ from typing_extensions import override
 from invgraphics.config import Slot
 from invgraphics.core import Context, Field, Quantity, Scene
 from invgraphics.renderers.distance_density import LogisticDensity
-from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, least_deviation, make_volumetric
+from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, least_width, make_volumetric
 from invgraphics.renderers.up_sampling import UpSamplingConfig
 from invgraphics.renderers.volumetric import Volumetric
 
 DEVIATION = math.pi / math.sqrt(3)
-"""Standard deviation of the logistic distribution, times s."""
+"""Standard deviation of the logistic distribution, over 1 / s."""
 EXPONENT = 10.0
 """The parameter of s is v = log(s) / 10 (NeuS, its code): a step of the optimiser multiplies s."""
 
@@ -76,10 +76,8 @@ class NeuSConfig:
 
     def _resolved(self, scene: Scene) -> NeuSConfig:
         """The settings with a schedule that stays as wide as ``min_deviation``."""
-        least = least_deviation(self.min_deviation, scene)
-        if self.change != "scheduled" or not least:
-            return self
-        most = DEVIATION / least
+        least = least_width(self, DEVIATION, scene)
+        most = 1 / least if least else math.inf
         return replace(self, sharpness=min(self.sharpness, most), sharpness_final=min(self.sharpness_final, most))
 
 

@@ -14,7 +14,7 @@ from invgraphics.config import Slot
 from invgraphics.core import Context, Field, Quantity, Scene
 from invgraphics.renderers.distance_density import LaplaceDensity
 from invgraphics.renderers.error_bounded import ErrorBoundedConfig
-from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, least_deviation, make_volumetric
+from invgraphics.renderers.hybrid import Change, Hybrid, check_settings, least_width, make_volumetric
 from invgraphics.renderers.volumetric import Volumetric
 
 DEVIATION = math.sqrt(2)
@@ -77,9 +77,7 @@ class VolSDFConfig:
 
     def _resolved(self, scene: Scene) -> VolSDFConfig:
         """The settings with a schedule that stays as wide as ``min_deviation``."""
-        least = least_deviation(self.min_deviation, scene) / DEVIATION
-        if self.change != "scheduled":
-            return self
+        least = least_width(self, DEVIATION, scene)
         return replace(self, beta=max(self.beta, least), beta_final=max(self.beta_final, least))
 
 

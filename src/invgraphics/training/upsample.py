@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal, cast
 
-import torch
 from torch import nn
 from typing_extensions import override
 
@@ -104,7 +103,6 @@ class Upsample(MilestoneHook):
         return now ** (1 - share) * min(self._config.resolution, limit) ** share
 
 
-@torch.no_grad()
 def _resize(sizes: list[tuple[LatticeEncoding, float]], edges: list[float]) -> None:
     for encoding, resolution in sizes:
         encoding.resize(vertices_along(resolution, edges))

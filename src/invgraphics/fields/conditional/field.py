@@ -23,7 +23,7 @@ from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Scene
 from invgraphics.errors import InputError
 from invgraphics.fields.conditional.layers import Conditioning, make_layer
-from invgraphics.fields.encoded import build_encoding, encode_samples, resolved
+from invgraphics.fields.encoded import build_encoding, encode_samples, resolve_encodings
 from invgraphics.fields.encodings.frequency import FrequencyConfig
 from invgraphics.fields.mlp import truncated_exp
 
@@ -69,7 +69,7 @@ class ConditionalFieldConfig:
         rows = torch.tensor([subjects.index(subject) for subject in shown])
         codes = CODE_SPREAD * torch.randn(len(subjects), self.code)
         return ConditionalField(
-            ConditionalNetwork(resolved(self, scene), scene.bounds, scene.colour), codes, rows, tuple(subjects)
+            ConditionalNetwork(resolve_encodings(self, scene), scene.bounds, scene.colour), codes, rows, tuple(subjects)
         )
 
 
