@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +22,22 @@ def file_name(key: str) -> str:
 def common_value(texts: Sequence[str]) -> str:
     """The value that all texts share; empty where they differ, or there is none."""
     return texts[0] if len(set(texts)) == 1 else ""
+
+
+def name_lines(name: str, letters: int, most: int = 4) -> list[str]:
+    """Break a method's name into at most ``most`` lines of at most ``letters`` each, after slashes, colons and blanks.
+
+    Only what is longer than a line breaks after dots, or anywhere. What does not fit is left out, and an ellipsis says so.
+    """
+    lines = [""]
+    for word in re.findall(r"[^/: ]*[/: ]|[^/: ]+", name):
+        parts = [word] if len(word.rstrip()) <= letters else re.findall(rf"[^.]{{0,{letters - 1}}}\.|[^.]{{1,{letters}}}", word)
+        for part in parts:
+            if len(lines[-1] + part.rstrip()) > letters:
+                lines.append("")
+            lines[-1] += part
+    lines = [line.strip() for line in lines]
+    return lines if len(lines) <= most else [*lines[: most - 1], lines[most - 1][: letters - 1] + "…"]
 
 
 def duration(seconds: float) -> str:

@@ -22,7 +22,8 @@ from PIL import Image
 from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.data.factors import METHOD, Observation
 from invgraphics.report.figures import views as pictures
-from invgraphics.report.figures.distributions import per_view
+from invgraphics.report.figures.curves import draw_curves
+from invgraphics.report.figures.distributions import draw_distributions, per_view
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
 from invgraphics.report.statistics.effects import effects_of
@@ -35,7 +36,7 @@ from invgraphics.report.wording import budget_words, listing, quality_quantity, 
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import Score
-from invgraphics.text import duration
+from invgraphics.text import duration, name_lines
 
 
 def test_pareto_front_is_what_brute_force_finds() -> None:
@@ -253,6 +254,34 @@ def test_colours_stand_out_on_both_pages() -> None:
         assert contrast(tone.light, PAGE.light) >= 4.5
         assert contrast(tone.dark, PAGE.dark) >= 4.5
     assert contrast(GRID.light, PAGE.light) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("name", "lines"),
+    [
+        ("splatting/gaussians-absgrad", ["splatting/gaussians-absgrad"]),
+        ("volumetric/hash:field.width=16:batches.rays=64", ["volumetric/hash:", "field.width=16:", "batches.rays=64"]),
+        ("optimiser.groups.background.lr=0.0015", ["optimiser.groups.background.", "lr=0.0015"]),
+        ("x" * 60, ["x" * 28, "x" * 28, "xxxx"]),
+        ("a/" * 100, ["a/" * 14, "a/" * 14, "a/" * 14, "a/" * 13 + "a…"]),
+    ],
+)
+def test_long_names_are_broken_where_they_may(name: str, lines: list[str]) -> None:
+    assert name_lines(name, 28) == lines
+
+
+def test_plots_of_long_names_keep_their_room(comparison_folder: Path, tmp_path: Path) -> None:
+    """Layout that fails is an error of the whole suite: see `filterwarnings`."""
+    comparison = read_comparison(comparison_folder)
+    longer = {
+        method: f"{method}:optimiser.groups.colour.lr=0.0012345:field.count=60:field.sh_degree=0"
+        for method in comparison.methods
+    }
+    runs = tuple(replace(run, method=longer[run.method]) for run in comparison.runs)
+    comparison = replace(comparison, methods=tuple(longer.values()), runs=runs, shown=())
+    summary = summarise(comparison)
+    assert draw_curves(comparison, summary, tmp_path) is not None
+    assert len(draw_distributions(comparison, summary, tmp_path)) == len(quality_columns(comparison))
 
 
 def test_labels_are_pushed_apart_no_further_than_needed() -> None:

@@ -15,12 +15,15 @@ from invgraphics.report.figures.style import MUTED, Figure, SeriesStyle, canvas,
 from invgraphics.report.statistics.intervals import band
 from invgraphics.report.statistics.summary import Summary
 from invgraphics.runs.run import Run
+from invgraphics.text import name_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDE = (940.0, 400.0)
 NARROW = (400.0, 380.0)
+LINE, WIDE_LETTERS, NARROW_LETTERS = 18.0, 32, 42
+"""CSS pixels of a label's line, and letters on it."""
 
 MANY, STRONG, FAINT = 4, 0.16, 0.08
 """Bands of more than ``MANY`` methods are drawn fainter."""
@@ -52,7 +55,8 @@ def _last(run: Run) -> float | None:
 
 def _draw(comparison: Comparison, summary: Summary, stem: Path, size: tuple[float, float]) -> Path:
     narrow = size == NARROW
-    with canvas(*size) as (figure, axes):
+    height = size[1] + _more_height([method for _, method in comparison.drawn_methods], narrow)
+    with canvas(size[0], height) as (figure, axes):
         ends: list[End] = []
         values: list[float] = []
         several = len(comparison.drawn_methods) > MANY
@@ -69,8 +73,15 @@ def _draw(comparison: Comparison, summary: Summary, stem: Path, size: tuple[floa
         if narrow:
             _legend(axes, ends)
         else:
-            _end_labels(axes, ends)
+            _end_labels(axes, ends, height)
         return save(figure, stem)
+
+
+def _more_height(methods: Sequence[str], narrow: bool) -> float:
+    """Pixels by which a plot is higher than usual, for many or long names."""
+    if narrow:
+        return max(0.0, LINE * sum(len(name_lines(method, NARROW_LETTERS)) for method in methods) - 0.3 * NARROW[1])
+    return max(0.0, LINE * max(len(name_lines(method, WIDE_LETTERS)) for method in methods) * len(methods) - 0.8 * WIDE[1])
 
 
 Curve = tuple[Float[ndarray, " time"], Float[ndarray, " time"]]
@@ -139,16 +150,22 @@ def _reference_lines(axes: Axes, comparison: Comparison, summary: Summary, value
 def _legend(axes: Axes, ends: Sequence[End]) -> None:
     from matplotlib.lines import Line2D
 
-    looks = [(series_style(series), f"{method}  {psnr:.1f}") for series, method, psnr in ends]
+    looks = [(series_style(series), _ended(method, psnr, NARROW_LETTERS)) for series, method, psnr in ends]
     handles = [Line2D([], [], color=look.colour, linestyle=look.dash, marker=look.marker, label=name) for look, name in looks]
     axes.figure.legend(handles=handles, loc="outside upper left", ncols=1, frameon=False, fontsize=12)
 
 
-def _end_labels(axes: Axes, ends: Sequence[End]) -> None:
-    """Label each line at its end, overlapping labels moved apart."""
+def _ended(method: str, psnr: float, letters: int) -> str:
+    return "\n".join(name_lines(method, letters)) + f"  {psnr:.1f}"
+
+
+def _end_labels(axes: Axes, ends: Sequence[End], height: float) -> None:
+    """Label each line at its end, overlapping labels moved apart; ``height`` is the plot's in pixels."""
     bottom, top = axes.get_ylim()
-    places = spread_labels([psnr for *_, psnr in ends], 18 / 330 * (top - bottom), bottom, top)
-    for (series, method, psnr), place in zip(ends, places, strict=True):
+    texts = [_ended(method, psnr, WIDE_LETTERS) for _, method, psnr in ends]
+    gap = LINE * max(text.count("\n") + 1 for text in texts) / (height - 70) * (top - bottom)
+    places = spread_labels([psnr for *_, psnr in ends], gap, bottom, top)
+    for (series, _, _), text, place in zip(ends, texts, places, strict=True):
         style: dict[str, Any] = {
             "color": series_style(series).colour,
             "fontweight": "bold",
@@ -156,5 +173,4 @@ def _end_labels(axes: Axes, ends: Sequence[End]) -> None:
             "annotation_clip": False,
         }
         coordinates = axes.get_yaxis_transform()
-        text = f"{method}  {psnr:.1f}"
         axes.annotate(text, (1.0, place), (12, 0), xycoords=coordinates, textcoords="offset points", **style)

@@ -14,7 +14,10 @@ from invgraphics.report.statistics.summary import Summary
 from invgraphics.report.statistics.values import clipped
 from invgraphics.report.wording import MeasuredQuantity
 from invgraphics.runs.run import Run
-from invgraphics.text import file_name
+from invgraphics.text import file_name, name_lines
+
+LETTERS = 28
+"""Of a line of a method's name beside its scores."""
 
 
 def draw_distributions(comparison: Comparison, summary: Summary, folder: Path) -> list[tuple[MeasuredQuantity, Figure]]:
@@ -66,7 +69,7 @@ def _draw(summary: Summary, column: MeasuredQuantity, values: dict[int, list[flo
                 "zorder": 3,
             }
             axes.plot(scores, heights, look.marker, color=look.colour, **dots)
-        axes.set_yticks(range(len(shown)), [row.label for row in shown], color=INK.light)
+        axes.set_yticks(range(len(shown)), ["\n".join(name_lines(row.label, LETTERS)) for row in shown], color=INK.light)
         axes.set_ylim(len(shown) - 0.45, -0.55)
         axes.grid(visible=False, axis="y")
         axes.tick_params(axis="y", length=0)

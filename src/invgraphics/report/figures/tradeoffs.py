@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics.report.figures.style import INK, MUTED, PAGE, PANEL, Figure, canvas, save, series_style
 from invgraphics.report.statistics.summary import Row, Summary, pareto_front
 from invgraphics.report.wording import TIMES, MeasuredQuantity, listing
+from invgraphics.text import name_lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -119,12 +120,13 @@ def _quality_limits(points: Sequence[Point]) -> tuple[float, float]:
 
 def _cost_axis(axes: Axes, values: Sequence[float]) -> None:
     """Scale the cost axis: logarithmic where costs differ by more than a quarter, else linear."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     low, high = min(values), max(values)
     if high / low <= 1.25:
         middle = (low + high) / 2
         axes.set_xlim(middle * 0.75, middle * 1.25)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
         return
     axes.set_xscale("log")
     pad = (high / low) ** 0.25
@@ -149,8 +151,8 @@ def _staircase(axes: Axes, front: Sequence[Point], cost: MeasuredQuantity, quali
     axes.set_ylim(bottom, top)
 
 
-LABEL_HEIGHT, LETTER_WIDTH, MARKER = 15.0, 7.3, 15.0
-"""Estimated sizes in CSS pixels: of a bold label's line and letters, and of a marker with its outline."""
+LABEL_HEIGHT, LETTER_WIDTH, MARKER, LETTERS = 15.0, 7.3, 15.0, 28
+"""Estimated sizes in CSS pixels: of a bold label's line and letters, and of a marker with its outline; letters of a line."""
 
 Box = tuple[float, float, float, float]
 """Left, bottom, right, top in CSS pixels."""
@@ -162,10 +164,12 @@ def _labels(axes: Axes, points: Sequence[Point]) -> None:
     places = [axes.transData.transform((point.cost, point.quality)) for point in points]
     taken = [_box(x, y, MARKER, MARKER) for x, y in places]
     for point, (x, y) in zip(points, places, strict=True):
-        width = LETTER_WIDTH * len(point.row.label)
+        lines = name_lines(point.row.label, LETTERS)
+        width, height = LETTER_WIDTH * max(map(len, lines)), LABEL_HEIGHT * len(lines)
+        beyond = MARKER / 2 + 3 + height / 2
         shift = MARKER / 2 + 3 + width / 2
-        offsets = [(side * shift, rise) for rise in (0, 13, -13) for side in (1, -1)] + [(0.0, 18.0), (0.0, -18.0)]
-        boxes = [_box(x + right, y + up, width, LABEL_HEIGHT) for right, up in offsets]
+        offsets = [(side * shift, rise) for rise in (0, 13, -13) for side in (1, -1)] + [(0.0, beyond), (0.0, -beyond)]
+        boxes = [_box(x + right, y + up, width, height) for right, up in offsets]
         best = min(range(len(boxes)), key=lambda i: _clutter(boxes[i], taken, frame))
         taken.append(boxes[best])
         style: dict[str, Any] = {
@@ -175,7 +179,7 @@ def _labels(axes: Axes, points: Sequence[Point]) -> None:
             "fontweight": "bold",
             "bbox": {"facecolor": PAGE.light, "edgecolor": "none", "pad": 1.0},
         }
-        axes.annotate(point.row.label, (point.cost, point.quality), offsets[best], textcoords="offset points", **style)
+        axes.annotate("\n".join(lines), (point.cost, point.quality), offsets[best], textcoords="offset points", **style)
 
 
 def _box(x: float, y: float, width: float, height: float) -> Box:
