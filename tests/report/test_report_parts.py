@@ -22,7 +22,7 @@ from PIL import Image
 from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.data.factors import METHOD, Observation
 from invgraphics.report.figures import views as pictures
-from invgraphics.report.figures.curves import draw_curves
+from invgraphics.report.figures.curves import NARROW, WIDE, draw_curves
 from invgraphics.report.figures.distributions import draw_distributions, per_view
 from invgraphics.report.figures.style import GRID, INK, MUTED, PAGE, SERIES, spread_labels
 from invgraphics.report.figures.tradeoffs import draw_tradeoffs
@@ -271,17 +271,27 @@ def test_long_names_are_broken_where_they_may(name: str, lines: list[str]) -> No
 
 
 def test_plots_of_long_names_keep_their_room(comparison_folder: Path, tmp_path: Path) -> None:
-    """Layout that fails is an error of the whole suite: see `filterwarnings`."""
+    """No line is long, plots of many names grow, and layout that fails is an error of the whole suite: see `filterwarnings`."""
     comparison = read_comparison(comparison_folder)
-    longer = {
-        method: f"{method}:optimiser.groups.colour.lr=0.0012345:field.count=60:field.sh_degree=0"
-        for method in comparison.methods
-    }
-    runs = tuple(replace(run, method=longer[run.method]) for run in comparison.runs)
-    comparison = replace(comparison, methods=tuple(longer.values()), runs=runs, shown=())
+    suffix = ":optimiser.groups.colour.lr=0.0012345:field.count=60:field.sh_degree="
+    longer = {f"{method}{suffix}{i}": method for i in range(6) for method in comparison.methods}
+    runs = tuple(replace(run, method=name) for name, method in longer.items() for run in comparison.runs_of(method))
+    comparison = replace(comparison, methods=tuple(longer), runs=runs, shown=())
     summary = summarise(comparison)
-    assert draw_curves(comparison, summary, tmp_path) is not None
-    assert len(draw_distributions(comparison, summary, tmp_path)) == len(quality_columns(comparison))
+    curves = draw_curves(comparison, summary, tmp_path)
+    assert curves is not None
+    assert curves.narrow is not None
+    for path, usual in ((curves.path, WIDE), (curves.narrow, NARROW)):
+        assert float(ElementTree.parse(path).getroot().attrib["height"].removesuffix("pt")) > usual[1]
+    strips = draw_distributions(comparison, summary, tmp_path)
+    assert len(strips) == len(quality_columns(comparison))
+    for path in tmp_path.glob("*.svg"):
+        named = [text for text in re.findall(r">([^<>]+)<", path.read_text()) if "optimiser" in text]
+        assert named, path
+        assert max(map(len, named)) <= 42
+    for figure in draw_tradeoffs(summary, tmp_path / "tradeoffs"):
+        named = [text for text in re.findall(r">([^<>]+)<", figure.path.read_text()) if "optimiser" in text]
+        assert max(map(len, named), default=0) <= 28
 
 
 def test_labels_are_pushed_apart_no_further_than_needed() -> None:
