@@ -145,7 +145,15 @@ def test_surfaces_and_neighbours_are_measured_by_both_implementations(monkeypatc
     monkeypatch.setattr(surface_cases, "QUICK_MESH_SIZES", ((12, 24),))
     monkeypatch.setattr(surface_cases, "QUICK_NEAR_POINTS", ((60, 40),))
     results = bench(BenchRequest(("trace", "mesh", "near"), quick=True))
-    for operation in ("sdf_values", "sdf_trace", "mesh_rasterise", "mesh_interpolate", "near_points"):
+    for operation in (
+        "sdf_values",
+        "sdf_radiance",
+        "sdf_skip",
+        "sdf_trace",
+        "mesh_rasterise",
+        "mesh_interpolate",
+        "near_points",
+    ):
         for name in ("reference", "numba"):
             found = results.find(operation, name, FORWARD)
             assert found is not None and found.timing.median > 0 and found.amount > 0, (operation, name)

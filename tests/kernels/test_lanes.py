@@ -32,11 +32,13 @@ def _arithmetic(x, y, out):
     chosen = lanes.where((a > b) & (b <= np.float32(0.5)), a, np.float32(7.0))
     lanes.store(out, index(2) + LANES, chosen)
     lanes.store(out, index(2) + LANES + LANES, lanes.lane_index() + lanes.broadcast(np.float32(3.0)))
+    either = lanes.where(~((a > b) | (b > np.float32(1.0))), a, np.float32(9.0))
+    lanes.store(out, index(2) + LANES + LANES + LANES, either)
     return lanes.any_of(a < b), lanes.any_of(a >= np.float32(100.0))
 
 
 def test_arithmetic() -> None:
-    x, y, out = numbers(GROUP + 1), numbers(GROUP), np.zeros(2 + 3 * GROUP, np.float32)
+    x, y, out = numbers(GROUP + 1), numbers(GROUP), np.zeros(2 + 4 * GROUP, np.float32)
     some, none = _arithmetic(x, y, out)
     a = x[1:]
     total = a * 2 + y / a + y + np.floor(a) + np.rint(y) + np.sqrt(np.abs(y))
@@ -44,7 +46,8 @@ def test_arithmetic() -> None:
     assert (out[:2] == 0).all()
     np.testing.assert_allclose(out[2 : 2 + GROUP], np.maximum(np.minimum(total, a), -1), rtol=1e-6)
     np.testing.assert_array_equal(out[2 + GROUP : 2 + 2 * GROUP], np.where((a > y) & (y <= 0.5), a, np.float32(7)))
-    np.testing.assert_array_equal(out[2 + 2 * GROUP :], np.arange(GROUP) + 3)
+    np.testing.assert_array_equal(out[2 + 2 * GROUP : 2 + 3 * GROUP], np.arange(GROUP) + 3)
+    np.testing.assert_array_equal(out[2 + 3 * GROUP :], np.where((a > y) | (y > 1), np.float32(9), a))
 
 
 @compiled

@@ -12,7 +12,9 @@ from invgraphics.files import writing_text
 
 FORWARD, BOTH = "forward", "forward+backward"
 """Directions."""
-FORWARD_ONLY = ("ray_march", "ngp_render", "sdf_values", "sdf_trace", "mesh_rasterise", "near_points")
+FORWARD_ONLY = (
+    "ray_march", "ngp_render", "sdf_values", "sdf_radiance", "sdf_skip", "sdf_trace", "mesh_rasterise", "near_points",
+)  # fmt: skip
 """Operations without a gradient."""
 
 SIZE_KEYS = (

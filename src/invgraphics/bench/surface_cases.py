@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from invgraphics import kernels
 from invgraphics.bench import limits
@@ -25,11 +26,23 @@ from invgraphics.kernels import near
 from invgraphics.kernels.types import TracingLimits
 
 TRACE_RAYS, QUICK_TRACE_RAYS = (1 << 10, 1 << 12, 1 << 14), (1 << 10, 1 << 12)
+GRID = HashConfig(levels=8, log2_size=15, base=16, finest=512)
 DISTANCE = NeuralFieldConfig(
-    geometry="sdf", layers=1, width=32, skip=-1, encoding=HashConfig(levels=8, log2_size=15, base=16, finest=512)
+    GRID,
+    "sdf",
+    layers=1,
+    width=32,
+    skip=-1,
+    geometry_features=13,
+    colour_layers=2,
+    colour_width=32,
+    direction="sh",
+    appearance=GRID,
 )
-"""The hash grid's distance of `sphere-tracing/hash`, laptop, as the sphere that a fit starts from."""
+"""The field of `sphere-tracing/hash`, laptop, as the sphere that a fit starts from."""
 LIMITS = TracingLimits(steps=128, relaxation=1.2, refinements=8, least=1e-3, tolerance=1e-6, depth=0.03)
+CELLS = 34
+"""Along each edge of the grid of distances; a picture of 400 pixels has as many."""
 DISTANCES, QUICK_DISTANCES = (1 << 14, 1 << 17), (1 << 14,)
 """Positions at which a distance is evaluated."""
 
@@ -47,12 +60,14 @@ MOST_POINTS_FOR_REFERENCE = 1 << 14
 
 
 def signed_distances(quick: bool) -> Iterator[Case]:
-    """A hash grid's distance in one pass: at positions in the order of rays, and by sphere tracing."""
-    levels = DISTANCE.encoding.levels
+    """A hash grid's distance in one pass: at positions in the order of rays, where colour is too, and along whole rays."""
+    levels = GRID.levels
     for positions in QUICK_DISTANCES if quick else DISTANCES:
         sizes = {"levels": levels, "positions": positions}
         yield Case("sdf_values", sizes, lambda positions=positions: _distances(positions))
+        yield Case("sdf_radiance", sizes, lambda positions=positions: _colours(positions))
     for rays in QUICK_TRACE_RAYS if quick else TRACE_RAYS:
+        yield Case("sdf_skip", {"resolution": CELLS, "rays": rays}, lambda rays=rays: _skip(rays))
         yield Case("sdf_trace", {"levels": levels, "rays": rays}, lambda rays=rays: _trace(rays))
 
 
@@ -88,6 +103,23 @@ def _distances(count: int) -> dict[str, KernelPass]:
     evaluate = lambda: kernels.sdf_values(places, region, field)  # noqa: E731
     products = sum(weight.numel() for weight, _ in field.net)
     return {FORWARD: KernelPass(evaluate, 2.0 * products * count, limits.sgemm(), "flop")}
+
+
+def _colours(count: int) -> dict[str, KernelPass]:
+    field, region, places = sphere_distance(), bounds(), bounds().from_unit(ray_ordered(count))
+    assert field.colour is not None
+    directions = normalize(places, dim=1)
+    evaluate = lambda: kernels.sdf_radiance(places, directions, region, field)  # noqa: E731
+    products = sum(weight.numel() for weight, _ in (*field.colour.geometry_net, *field.colour.net))
+    return {FORWARD: KernelPass(evaluate, 2.0 * products * count, limits.sgemm(), "flop")}
+
+
+def _skip(count: int) -> dict[str, KernelPass]:
+    region, rays = bounds(), some_rays(count)
+    distances = (region.cell_centres([CELLS] * 3).norm(dim=1) - RADIUS).reshape([CELLS] * 3)
+    least = float(region.half.mean()) / (2 * CELLS)
+    skip = lambda: kernels.sdf_skip(rays, region, distances, LIMITS.depth, least)  # noqa: E731
+    return {FORWARD: KernelPass(skip, float(count), unit="rays")}
 
 
 def _trace(count: int) -> dict[str, KernelPass]:

@@ -74,6 +74,15 @@ class Bounds:
         # Rounding must not put those of a box outside it, where a field has no density.
         return position.clamp(self.lo, self.hi) if self.space == "box" else position
 
+    def cell_centres(self, resolution: Sequence[int]) -> Float[Tensor, "n 3"]:
+        """Positions of the centres of a box's cells, none of them on a face; z runs fastest.
+
+        Args:
+            resolution: cells along x, y and z.
+        """
+        half = self.half / torch.tensor(resolution, dtype=self.lo.dtype, device=self.lo.device)
+        return Bounds(self.lo + half, self.hi - half).vertices(resolution)
+
     def unit_covariance(self, position: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"]) -> Float[Tensor, "m 3 3"]:
         """Transform covariances to the unit cube by the linearised map, J Σ Jᵀ (mip-NeRF 360, equation 9).
 

@@ -87,6 +87,28 @@ class FusedNGP:
 
 
 @dataclass(frozen=True, eq=False)
+class FusedColour:
+    """Detached parameters of the colour of a surface, for fused inference beside a `FusedSDF`.
+
+    Attributes:
+        geometry_net: as `FusedSDF.net`, but its outputs are the distance and the geometry features.
+        table: features of all levels of an appearance's hash grid; no rows without one.
+        grid: geometry of those levels; ``None`` without.
+        net: weight (outs, ins) and bias of each layer of a ReLU network from the geometry features, the appearance's and those
+            of direction to raw RGB.
+        sh_bands: bands of spherical harmonics that encode the direction, 0 to 4.
+        colour_space: activation of raw RGB, sigmoid for ``srgb`` and softplus for ``linear``.
+    """
+
+    geometry_net: tuple[tuple[Tensor, Tensor], ...]
+    table: Float[Tensor, "entries f"]
+    grid: HashGrid | None
+    net: tuple[tuple[Tensor, Tensor], ...]
+    sh_bands: int
+    colour_space: Literal["srgb", "linear"]
+
+
+@dataclass(frozen=True, eq=False)
 class FusedSDF:
     """Detached parameters of a signed distance over a hash grid or over octaves, for fused sphere tracing.
 
@@ -100,6 +122,7 @@ class FusedSDF:
         sharpness: of the softplus.
         coordinate_scale: the network's coordinates over x.
         scale: signed distance in local units over the network's output.
+        colour: of its surface; ``None`` where kernels do not support it.
     """
 
     table: Float[Tensor, "entries f"]
@@ -109,3 +132,4 @@ class FusedSDF:
     sharpness: float
     coordinate_scale: Float[Tensor, " 3"]
     scale: float
+    colour: FusedColour | None = None

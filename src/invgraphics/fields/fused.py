@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeGuard
 
 import torch
 from torch import Tensor, nn
 
-from invgraphics.core.field import Encoding
+from invgraphics import kernels
+from invgraphics.core.bounds import Bounds
+from invgraphics.core.field import Encoding, Quantity
 from invgraphics.core.fused import ColourHead, CombinedLattices, Corner, DensityHead, FusedLattice, Layers
-from invgraphics.core.ngp import FusedNGP, FusedSDF
+from invgraphics.core.ngp import FusedColour, FusedNGP, FusedSDF
+from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.fields.encodings.frequency import FrequencyEncoding
 from invgraphics.fields.encodings.hash import HashEncoding
 from invgraphics.fields.encodings.lattices import LatticeFeatures
@@ -60,13 +63,12 @@ def fused_parts(field: FieldParts) -> FusedNGP | FusedLattice | None:
 
 def _hash_parts(field: FieldParts) -> FusedNGP | None:
     config, encoding = field.config, field.encoding
-    if not config.two_plain_networks or config.direction not in ("sh", "none") or not isinstance(encoding, HashEncoding):
+    if not config.two_plain_networks or config.direction not in ("sh", "none") or field.appearance is not None:
         return None
     # Entries of other widths have no compiled kernel, and the plain one keeps every sample of a picture.
-    if encoding.window_alpha is not None or encoding.grid.features != 2:
+    if not _is_paired_grid(encoding):
         return None
     geometry, colour = _layers(field.geometry_net), _layers(field.colour_net)
-    bands = config.direction_degree if config.direction == "sh" else 0
     return FusedNGP(
         table=encoding.table.detach(),
         grid=encoding.grid,
@@ -74,23 +76,22 @@ def _hash_parts(field: FieldParts) -> FusedNGP | None:
         colour_net=colour,
         density_activation=config.density_activation,
         density_bias=config.density_bias,
-        sh_bands=bands,
+        sh_bands=_sh_bands(config),
         colour_space=field.colour,
         contracted_density=field.contracted_density,
     )
 
 
-def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_scale: Tensor, scale: float) -> FusedSDF | None:
+def sdf_parts(field: FieldParts, coordinate_scale: Tensor, scale: float) -> FusedSDF | None:
     """Parameters of a signed distance over a hash grid of two features per entry or over octaves; ``None`` for others.
 
     Args:
-        config: the field's settings.
-        encoding: of positions.
-        net: network of coordinates and features to the distance.
+        field: modules and settings; ``geometry_net`` takes coordinates and features.
         coordinate_scale: see `FusedSDF`.
         scale: local length of the network's unit.
     """
-    if config.skip >= 0 or net.sharpness is None or not config.layers:
+    encoding, net = field.encoding, field.geometry_net
+    if field.config.skip >= 0 or net is None or net.sharpness is None or not field.config.layers:
         return None
     *hidden, (weight, bias) = net.layers()
     if not isinstance(encoding, HashEncoding | FrequencyEncoding) or encoding.window_alpha is not None:
@@ -109,7 +110,42 @@ def sdf_parts(config: NeuralSettings, encoding: Encoding, net: Mlp, coordinate_s
         sharpness=net.sharpness,
         coordinate_scale=coordinate_scale,
         scale=scale,
+        colour=_surface_colour(field),
     )
+
+
+def fused_surface(parts: FusedSDF | None, samples: Samples, bounds: Bounds, want: Quantity) -> FieldValues | None:
+    """Signed distances alone or radiance alone by a fused kernel, outside the graph; ``None`` without its parameters."""
+    if parts is None:
+        return None
+    if want == Quantity.SDF:
+        return FieldValues(sdf=kernels.sdf_values(samples.position, bounds, parts))
+    if parts.colour is None or samples.features is not None:
+        return None
+    return FieldValues(radiance=kernels.sdf_radiance(samples.position, samples.direction, bounds, parts))
+
+
+def _surface_colour(field: FieldParts) -> FusedColour | None:
+    """Parameters of the colour of a signed distance; ``None`` where colour sees more than kernels do."""
+    config, appearance = field.config, field.appearance
+    if not config.two_plain_networks or config.direction not in ("sh", "none"):
+        return None
+    geometry, colour = _layers(field.geometry_net), _layers(field.colour_net)
+    table, grid = colour[0][0].new_zeros(0, 2), None
+    if appearance is not None:
+        if not _is_paired_grid(appearance):
+            return None
+        table, grid = appearance.table.detach(), appearance.grid
+    return FusedColour(geometry, table, grid, colour, _sh_bands(config), field.colour)
+
+
+def _is_paired_grid(encoding: Encoding) -> TypeGuard[HashEncoding]:
+    """Whether an encoding is a hash grid with two features per entry and without a coarse-to-fine window."""
+    return isinstance(encoding, HashEncoding) and encoding.window_alpha is None and encoding.grid.features == 2
+
+
+def _sh_bands(config: NeuralSettings) -> int:
+    return config.direction_degree if config.direction == "sh" else 0
 
 
 def _lattice_parts(field: FieldParts) -> FusedLattice | None:

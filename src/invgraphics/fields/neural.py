@@ -24,7 +24,7 @@ from typing_extensions import override
 from invgraphics import kernels
 from invgraphics.core.bounds import Bounds, Space
 from invgraphics.core.field import Encoding, Field, Quantity
-from invgraphics.core.fused import FusedLattice
+from invgraphics.core.fused import Corner, FusedLattice
 from invgraphics.core.lattice import Lattice, LatticeEncoding, Role
 from invgraphics.core.ngp import FusedNGP, FusedSDF
 from invgraphics.core.samples import FieldValues, Samples
@@ -33,7 +33,7 @@ from invgraphics.fields import heads
 from invgraphics.fields.density import DensityActivation
 from invgraphics.fields.encoded import build_encoding, encode_samples, resolve_encodings
 from invgraphics.fields.encodings.lattices import LatticeFeatures, crop_lattices
-from invgraphics.fields.fused import FieldParts, fused_parts, sdf_parts
+from invgraphics.fields.fused import FieldParts, fused_parts, fused_surface, sdf_parts
 from invgraphics.fields.geometry import chunks, query_geometry
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
@@ -155,10 +155,11 @@ class NeuralField(Field):
         Features are the geometry features; of samples that hold them, geometry is not evaluated again where only radiance is
         wanted and colour sees no normal.
         """
-        if want == Quantity.SDF and not torch.is_grad_enabled():
-            sdf = self._fused_distance(samples.position)
-            if sdf is not None:
-                return FieldValues(sdf=sdf)
+        alone = want in (Quantity.SDF, Quantity.RADIANCE) and not torch.is_grad_enabled()
+        if alone and self._space == "box" and kernels.compiled("sdf_values", samples.position):
+            values = fused_surface(self.fused_sdf(self.bounds), samples, self.bounds, want)
+            if values is not None:
+                return values
         appearance = self._appearance(samples) if Quantity.RADIANCE in want else None
         sees_normal = Quantity.RADIANCE in want and "normal" in self.config.colour_inputs
         known = samples.features if self._needs_geometry_for_colour else samples.position[:, :0]
@@ -195,26 +196,20 @@ class NeuralField(Field):
                 return None
             lo, hi = (tuple(bounds.to_unit(corner).tolist()) for corner in (self.lo, self.hi))
             crop = lo, hi
-        geometry_net = self.geometry_net if self.config.geometry_head == "mlp" else None
-        colour_net = self.colour_net if self.config.head == "mlp" else None
-        geometry = self.config, self.encoding, geometry_net
-        colour = self.appearance, self.basis, colour_net, self.colour
-        return fused_parts(FieldParts(*geometry, *colour, self._density_scale, self._contracted_density, crop))
+        return fused_parts(self._parts(crop))
 
     @override
     def fused_sdf(self, bounds: Bounds) -> FusedSDF | None:
         """Detached parameters of a signed distance over ``bounds``, its own: of a hash grid or octaves (see `sdf_parts`)."""
-        if not self._covers(bounds) or self.config.geometry != "sdf" or not torch.equal(self.bounds.centre, self._middle):
+        if self.config.geometry != "sdf" or not self._covers(bounds) or not torch.equal(self.bounds.centre, self._middle):
             return None
-        return sdf_parts(self.config, self.encoding, self.geometry_net, self.bounds.half / self._half, self._half)
+        return sdf_parts(self._parts(), self.bounds.half / self._half, self._half)
 
-    def _fused_distance(self, position: Float[Tensor, "m 3"]) -> Float[Tensor, " m"] | None:
-        """Signed distances by one fused kernel, outside the graph, where it supports the field; else ``None``."""
-        if self._space != "box" or not kernels.compiled("sdf_values", position):
-            return None
-        bounds = self.bounds
-        parts = self.fused_sdf(bounds)
-        return None if parts is None else kernels.sdf_values(position, bounds, parts)
+    def _parts(self, crop: tuple[Corner, Corner] | None = None) -> FieldParts:
+        geometry_net = self.geometry_net if self.config.geometry_head == "mlp" else None
+        colour_net = self.colour_net if self.config.head == "mlp" else None
+        geometry, colour = (self.config, self.encoding, geometry_net), (self.appearance, self.basis, colour_net)
+        return FieldParts(*geometry, *colour, self.colour, self._density_scale, self._contracted_density, crop)
 
     def _covers(self, bounds: Bounds) -> bool:
         return bounds.space == self._space and torch.equal(bounds.lo, self.lo) and torch.equal(bounds.hi, self.hi)

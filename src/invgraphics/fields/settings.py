@@ -106,10 +106,10 @@ class NeuralSettings:
 
     @property
     def two_plain_networks(self) -> bool:
-        """Whether colour and geometry are ReLU networks over one encoding, as fused kernels take them."""
+        """Whether colour and geometry are ReLU networks over features and direction alone, as fused kernels take them."""
         networks = self.geometry_head == self.head == "mlp" and self.hidden_activation == "relu"
         plain_colour = self.colour_activation == "sigmoid" and self.colour_padding == 0
-        bare = self.appearance is None and self.feature_octaves == 0 and not self.colour_inputs
+        bare = self.appearance_basis == 0 and self.feature_octaves == 0 and not self.colour_inputs
         return networks and plain_colour and bare
 
     def _check_heads(self) -> None:

@@ -27,6 +27,8 @@ from invgraphics.kernels.lattices import lattice_march as lattice_march
 from invgraphics.kernels.lattices import lattice_render as lattice_render
 from invgraphics.kernels.meshes import mesh_interpolate as mesh_interpolate
 from invgraphics.kernels.meshes import mesh_rasterise as mesh_rasterise
+from invgraphics.kernels.tracing import sdf_radiance as sdf_radiance
+from invgraphics.kernels.tracing import sdf_skip as sdf_skip
 from invgraphics.kernels.tracing import sdf_trace as sdf_trace
 from invgraphics.kernels.tracing import sdf_values as sdf_values
 

@@ -21,7 +21,8 @@ Opacity = Literal["peak", "physical", "extinction", "splat"]
 - ``extinction``: one density in space as well, whose optical depth along the shortest axis, from which a Gaussian looks
   largest, is that of ``peak``. The total over all parallel lines is the same for every direction, so that along another one
   the optical depth is ``θ 2π √(λ1 λ2) / I2(Σ')`` for ``θ = -ln(1 - a)``, where λ1 and λ2 are the larger eigenvalues of the
-  covariance, Σ' is its projection and ``I2(Σ') = 2π √det Σ'`` (Celarek et al. 2025): never less than θ.
+  covariance, Σ' is its projection and ``I2(Σ') = 2π √det Σ'`` (Celarek et al. 2025, the formulation ``Ots`` of their code,
+  whose θ has no upper limit): never less than θ.
 - ``splat``: alpha is ``a G``, as splatters have it, which ignores that light is absorbed along the way.
 """
 

@@ -1,4 +1,4 @@
-"""A fused signed distance at points and along rays, dispatched as the operations in `invgraphics.kernels`."""
+"""A fused signed distance at points, along rays and on a grid, dispatched as the operations in `invgraphics.kernels`."""
 
 from __future__ import annotations
 
@@ -25,6 +25,45 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
         First hits and closest approaches. Not differentiable.
     """
     return choose("sdf_trace", rays.origins)(rays, bounds, field, limits)
+
+
+def sdf_radiance(
+    position: Float[Tensor, "n 3"], direction: Float[Tensor, "n 3"], bounds: Bounds, field: FusedSDF
+) -> Float[Tensor, "n 3"]:
+    """Radiance of a signed distance's field by two networks over hash grids or octaves: encode and evaluate in one pass.
+
+    Args:
+        position: where, local frame.
+        direction: of view, unit length.
+        bounds: a box, whose unit cube the field is over.
+        field: parameters of the signed distance and of its ``colour``, which it has to have.
+
+    Returns:
+        Radiance in the field's colour space. Not differentiable.
+    """
+    return choose("sdf_radiance", position)(position, direction, bounds, field)
+
+
+def sdf_skip(
+    rays: Rays, bounds: Bounds, distances: Float[Tensor, "rx ry rz"], margin: float, least: float, factor: float = 1.0
+) -> Float[Tensor, " n"]:
+    """Empty-space skipping by a grid of signed distances: sphere tracing (Hart 1996) with one read of memory per step.
+
+    In a cell whose centre is v from the surface, a point that is r from the centre is at least v - r from it, as far as the
+    distances are true ones.
+
+    Args:
+        rays: with near and far set; of those whose far is not beyond near, far is returned.
+        bounds: a box, of which each cell is a part.
+        distances: signed distances at the cells' centres, local units.
+        margin: distance that is kept from the surface.
+        least: the first step that is not longer than this is left out.
+        factor: of each step, below 1 for distances that grow faster than the way.
+
+    Returns:
+        Distance along each ray, from near to far, before which no surface is nearer than ``margin``. Not differentiable.
+    """
+    return choose("sdf_skip", rays.origins)(rays, bounds, distances, margin, least, factor)
 
 
 def sdf_values(position: Float[Tensor, "n 3"], bounds: Bounds, field: FusedSDF) -> Float[Tensor, " n"]:

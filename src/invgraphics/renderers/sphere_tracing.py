@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from invgraphics import kernels
 from invgraphics.core import (
+    Bounds,
     Camera,
     Context,
     Contributions,
@@ -27,6 +28,7 @@ from invgraphics.core import (
     SurfaceTrace,
     Trace,
 )
+from invgraphics.core.ngp import FusedSDF
 from invgraphics.kernels.reference.tracing import sphere_trace
 from invgraphics.kernels.types import TracedRays, TracingLimits
 from invgraphics.renderers.base import to_rendering
@@ -38,6 +40,19 @@ SATURATION = 8.0
 """Logit of opacity beyond which a ray counts as opaque, or as empty: the sigmoid is 3e-4 from 1, or from 0."""
 MIN_SLOPE = 0.05
 """Least slope of the distance along a ray at its hit, over the gradient's length: hits of grazing rays move infinitely fast."""
+
+
+CELLS_PER_RAY = 0.25
+"""Cells of a picture's grid of distances per ray: each costs a look-up, and spares rays one to three and a half.
+
+From 0.1 to 0.5 it hardly matters: five fits on four scenes at 200, 400 and 800 pixels.
+"""
+SKIPPED_SHARE = 0.8
+"""Share of a cell's distance that rays skip: fitted distances may grow faster than the way.
+
+With 1, up to 0.2 % of a picture's pixels change that do not with 0.8, for the worst of 17 fits (VolSDF on `materials`), and
+look-ups fall by 3 to 7 % (three fits).
+"""
 
 
 @dataclass(frozen=True)
@@ -105,10 +120,26 @@ class SphereTracing(RayRenderer):
         least, tolerance = config.least_step * unit, config.tolerance * unit
         return TracingLimits(config.steps, config.relaxation, config.refinements, least, tolerance, depth)
 
+    @override
+    def render_whole(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace] | None:
+        """A picture outside the graph, by kernels where they support the field; rays begin where a grid says that they may."""
+        fused = None if torch.is_grad_enabled() else _fused(field, ctx)
+        if fused is None:
+            return None
+        rays, limits = ctx.bounds.clip(camera.rays()), self.limits(ctx)
+        traced = kernels.sdf_trace(_skip_free_space(rays, ctx.bounds, fused, limits), ctx.bounds, fused, limits)
+        rendering, trace = self._shade(field, rays, traced, limits, ctx)
+        return rendering.reshape(camera.height, camera.width), trace
+
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; with normals if ``ctx.geometry`` is set."""
         rays, limits = ctx.bounds.clip(rays), self.limits(ctx)
-        traced = _trace(field, rays, limits, ctx)
+        return self._shade(field, rays, _trace(field, rays, limits, ctx), limits, ctx)
+
+    def _shade(
+        self, field: Field, rays: Rays, traced: TracedRays, limits: TracingLimits, ctx: Context
+    ) -> tuple[Rendering, Trace]:
+        """Render n rays of which it is known where they meet the surface."""
         sharpness = SATURATION / limits.depth
         logit = -sharpness * _lowest(field, rays, traced, ctx)
         surface = SurfaceTrace(logit, sharpness, traced.hit, traced.steps, traced.converged)
@@ -133,10 +164,26 @@ def opacity(logit: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     return (logit.clamp(-SATURATION, SATURATION).sigmoid() - low).clamp_min(0) / (high - low)
 
 
+def _fused(field: Field, ctx: Context) -> FusedSDF | None:
+    """Parameters of a field for compiled kernels; ``None`` where there are none."""
+    if ctx.bounds.space != "box" or not kernels.compiled("sdf_trace", ctx.bounds.lo):
+        return None
+    return field.fused_sdf(ctx.bounds)
+
+
+def _skip_free_space(rays: Rays, bounds: Bounds, fused: FusedSDF, limits: TracingLimits) -> Rays:
+    """Rays that begin where a grid of distances first leaves a surface possible, and before silhouettes begin to show."""
+    resolution = max(1, round((len(rays) * CELLS_PER_RAY) ** (1 / 3)))
+    cells = [resolution] * 3
+    distances = kernels.sdf_values(bounds.cell_centres(cells), bounds, fused).reshape(cells)
+    least, factor = float(bounds.half.mean()) / (2 * resolution), SKIPPED_SHARE * min(1.0, limits.relaxation)
+    return rays.within(kernels.sdf_skip(rays, bounds, distances, limits.depth, least, factor), rays.far)
+
+
 def _trace(field: Field, rays: Rays, limits: TracingLimits, ctx: Context) -> TracedRays:
     """Trace rays through any field, in one compiled pass where a kernel supports it."""
-    fused = field.fused_sdf(ctx.bounds) if ctx.bounds.space == "box" else None
-    if fused is not None and kernels.compiled("sdf_trace", rays.origins):
+    fused = _fused(field, ctx)
+    if fused is not None:
         return kernels.sdf_trace(rays, ctx.bounds, fused, limits)
 
     def distance(index: Int[Tensor, " k"], t: Float[Tensor, " k"]) -> Float[Tensor, " k"]:

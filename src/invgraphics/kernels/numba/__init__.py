@@ -19,7 +19,9 @@ from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise as mesh_rast
 from invgraphics.kernels.numba.near import near_points as near_points
 from invgraphics.kernels.numba.ngp.distance import sdf_values as sdf_values
 from invgraphics.kernels.numba.ngp.march import ngp_march as ngp_march
+from invgraphics.kernels.numba.ngp.radiance import sdf_radiance as sdf_radiance
 from invgraphics.kernels.numba.ngp.render import ngp_render as ngp_render
+from invgraphics.kernels.numba.ngp.skip import sdf_skip as sdf_skip
 from invgraphics.kernels.numba.ngp.trace import sdf_trace as sdf_trace
 from invgraphics.kernels.numba.rays.composite import composite as composite
 from invgraphics.kernels.numba.rays.march import ray_march as ray_march

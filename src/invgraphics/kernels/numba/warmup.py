@@ -12,7 +12,7 @@ from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.fused import ColourHead, CombinedLattices, DensityHead, FusedLattice
 from invgraphics.core.lattice import Lattice
-from invgraphics.core.ngp import FusedNGP, FusedSDF, HashGrid
+from invgraphics.core.ngp import FusedColour, FusedNGP, FusedSDF, HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.numba.adam import adam_rows
 from invgraphics.kernels.numba.fused.march import lattice_march
@@ -28,7 +28,9 @@ from invgraphics.kernels.numba.mesh.rasterise import mesh_rasterise
 from invgraphics.kernels.numba.near import near_points
 from invgraphics.kernels.numba.ngp.distance import sdf_values
 from invgraphics.kernels.numba.ngp.march import ngp_march
+from invgraphics.kernels.numba.ngp.radiance import sdf_radiance
 from invgraphics.kernels.numba.ngp.render import ngp_render
+from invgraphics.kernels.numba.ngp.skip import sdf_skip
 from invgraphics.kernels.numba.ngp.trace import sdf_trace
 from invgraphics.kernels.numba.rays.composite import composite
 from invgraphics.kernels.numba.rays.march import ray_march
@@ -109,6 +111,9 @@ def samples() -> None:
     net = (torch.zeros(8, 7), torch.zeros(8)), (torch.zeros(1, 8), torch.zeros(1))
     distance = FusedSDF(torch.zeros(levels.entries, 2), levels, 0, net, 100.0, torch.ones(3), 1.0)
     sdf_values(unit.detach(), bounds, distance)
+    seen = FusedColour(net, torch.zeros(levels.entries, 2), levels, ((torch.zeros(3, 4), torch.zeros(3)),), 0, "srgb")
+    sdf_radiance(unit.detach(), unit.detach(), bounds, replace(distance, colour=seen))
+    sdf_skip(rays, bounds, torch.ones(2, 2, 2), 1e-2, 1e-2, 1.0)
     sdf_trace(rays, bounds, distance, TracingLimits(2, 1.0, 1, 1e-3, 1e-3, 1e-2))
     planes = CombinedLattices(tuple(Lattice(torch.zeros(2, 2, 4), axes) for axes in ("xy", "xz", "yz")), "sum")
     dense = FusedLattice(planes, (), DensityHead("exp"), None, (), ColourHead("none"))

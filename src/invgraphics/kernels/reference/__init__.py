@@ -23,5 +23,7 @@ from invgraphics.kernels.reference.splat_raster import splat_bin as splat_bin
 from invgraphics.kernels.reference.splat_raster import splat_median as splat_median
 from invgraphics.kernels.reference.splat_raster import splat_rasterise as splat_rasterise
 from invgraphics.kernels.reference.ssim import ssim as ssim
+from invgraphics.kernels.reference.tracing import sdf_radiance as sdf_radiance
+from invgraphics.kernels.reference.tracing import sdf_skip as sdf_skip
 from invgraphics.kernels.reference.tracing import sdf_trace as sdf_trace
 from invgraphics.kernels.reference.tracing import sdf_values as sdf_values

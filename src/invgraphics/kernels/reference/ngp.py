@@ -86,18 +86,19 @@ def _query(field: FusedNGP, rays: Rays, bounds: Bounds, march: March) -> tuple[F
     direction = rays.directions[march.ray]
     position = midpoints(rays, march)
     features, _ = hash_encode(bounds.to_unit(position), field.table, field.grid)
-    outputs = _mlp(field.density_net, features)
+    outputs = relu_network(field.density_net, features)
     density = activated_density(outputs[:, 0] + field.density_bias, field.density_activation)
     if field.contracted_density > 0:
         density = density * (field.contracted_density * bounds.radial_scale(position))
     inputs = outputs[:, 1:]
     if field.sh_bands:
         inputs = torch.cat([inputs, harmonics.basis(direction, field.sh_bands - 1)], dim=1)
-    colour = _mlp(field.colour_net, inputs)
+    colour = relu_network(field.colour_net, inputs)
     return density, colour.sigmoid() if field.colour_space == "srgb" else softplus(colour)
 
 
-def _mlp(layers: tuple[tuple[Tensor, Tensor], ...], x: Float[Tensor, "m ins"]) -> Float[Tensor, "m outs"]:
+def relu_network(layers: tuple[tuple[Tensor, Tensor], ...], x: Float[Tensor, "m ins"]) -> Float[Tensor, "m outs"]:
+    """Outputs of an MLP whose layers before the last are rectified."""
     for weight, bias in layers[:-1]:
         x = relu(linear(x, weight, bias))
     return linear(x, *layers[-1])

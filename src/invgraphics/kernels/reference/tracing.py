@@ -13,10 +13,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import linear, softplus
 
+from invgraphics.core import harmonics
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.ngp import FusedSDF
 from invgraphics.core.rays import Rays
 from invgraphics.kernels.reference.hash import hash_encode
+from invgraphics.kernels.reference.ngp import relu_network
 from invgraphics.kernels.types import TracedRays, TracingLimits
 
 Distance = Callable[[Int[Tensor, " k"], Float[Tensor, " k"]], Float[Tensor, " k"]]
@@ -147,6 +149,27 @@ def _refine_closest(distance: Distance, state: Float[Tensor, "11 n"], limits: Tr
     state[_LOW, going], state[_LOW_T, going] = f, m
 
 
+@torch.no_grad()
+def sdf_skip(
+    rays: Rays, bounds: Bounds, distances: Float[Tensor, "rx ry rz"], margin: float, least: float, factor: float
+) -> Float[Tensor, " n"]:
+    """See `invgraphics.kernels.sdf_skip`."""
+    t, going = rays.near.clone(), torch.nonzero(rays.far > rays.near)[:, 0]
+    cells = torch.tensor(distances.shape, device=t.device)
+    edges = (bounds.hi - bounds.lo) / cells
+    while len(going):
+        place = (torch.addcmul(rays.origins[going], t[going, None], rays.directions[going]) - bounds.lo) / edges
+        cell = torch.minimum(place.floor().clamp_min(0), cells - 1)
+        away = ((place - cell - 0.5) * edges).norm(dim=1)
+        free = factor * (distances[tuple(cell.long().unbind(dim=1))] - away) - margin
+        moved = t[going] + free
+        far = (free > least) & (moved > t[going])
+        going, moved = going[far], moved[far]
+        t[going] = moved
+        going = going[moved < rays.far[going]]
+    return torch.minimum(t, rays.far)
+
+
 def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits) -> TracedRays:
     """See `invgraphics.kernels.sdf_trace`."""
 
@@ -158,11 +181,32 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
 
 def sdf_values(position: Float[Tensor, "k 3"], bounds: Bounds, field: FusedSDF) -> Float[Tensor, " k"]:
     """See `invgraphics.kernels.sdf_values`."""
+    return field.scale * _geometry(bounds.to_unit(position), field, field.net)[:, 0]
+
+
+@torch.no_grad()
+def sdf_radiance(
+    position: Float[Tensor, "k 3"], direction: Float[Tensor, "k 3"], bounds: Bounds, field: FusedSDF
+) -> Float[Tensor, "k 3"]:
+    """See `invgraphics.kernels.sdf_radiance`."""
+    colour = field.colour
+    assert colour is not None
     unit = bounds.to_unit(position)
+    inputs = [_geometry(unit, field, colour.geometry_net)[:, 1:]]
+    if colour.grid is not None:
+        inputs.append(hash_encode(unit, colour.table, colour.grid)[0])
+    if colour.sh_bands:
+        inputs.append(harmonics.basis(direction, colour.sh_bands - 1))
+    raw = relu_network(colour.net, torch.cat(inputs, dim=1))
+    return raw.sigmoid() if colour.colour_space == "srgb" else softplus(raw)
+
+
+def _geometry(unit: Float[Tensor, "k 3"], field: FusedSDF, net: tuple[tuple[Tensor, Tensor], ...]) -> Float[Tensor, "k outs"]:
+    """Outputs of a softplus network of coordinates and encoding."""
     x = torch.cat([(2 * unit - 1) * field.coordinate_scale, _encode(unit, field)], dim=1)
-    for weight, bias in field.net[:-1]:
+    for weight, bias in net[:-1]:
         x = softplus(linear(x, weight, bias), beta=field.sharpness)
-    return field.scale * linear(x, *field.net[-1])[:, 0]
+    return linear(x, *net[-1])
 
 
 def _encode(unit: Float[Tensor, "k 3"], field: FusedSDF) -> Float[Tensor, "k f"]:

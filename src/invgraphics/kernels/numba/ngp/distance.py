@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
-from invgraphics.core.ngp import FusedSDF
+from invgraphics.core.ngp import FusedSDF, HashGrid
 from invgraphics.kernels import reference
 from invgraphics.kernels.numba.hash.cells import BLOCK
 from invgraphics.kernels.numba.hash.encode import levels_of
@@ -55,16 +55,30 @@ def coordinates(points, x, first, settings, octaves):
                     sine, cosine = _TWO * sine * cosine, cosine * cosine - sine * sine
 
 
-def pack_sdf(field: FusedSDF) -> tuple[Any, ...]:
-    """The arguments ``table`` to ``settings`` of `values_at`."""
-    (weight, bias), *others = field.net
-    levels, octaves = _NO_LEVELS, field.octaves
+def pack_levels(grid: HashGrid | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A grid's `levels_of`, empty without one."""
+    return _NO_LEVELS if grid is None else levels_of(grid)
+
+
+def pack_sdf(field: FusedSDF, net: tuple[tuple[Tensor, Tensor], ...] | None = None) -> tuple[Any, ...]:
+    """The arguments ``table`` to ``settings`` of `values_at`, of another network over the same inputs where one is given."""
+    (weight, bias), *others = net or field.net
+    levels, octaves = pack_levels(field.grid), field.octaves
     if field.grid is not None:
-        levels, octaves = levels_of(field.grid), -1
+        octaves = -1
         weight = torch.cat([weight[:, 3:], weight[:, :3]], dim=1)
-    net = pack_network(((weight, bias), *others))
+    packed = pack_network(((weight, bias), *others))
     settings = np.array([field.sharpness, field.scale, *field.coordinate_scale.tolist()], np.float32)
-    return array(field.table).reshape(-1), levels, octaves, net, int(net[1].max()), settings
+    return array(field.table).reshape(-1), levels, octaves, packed, int(packed[1].max()), settings
+
+
+@inlined
+def gather(position, start, last, lo, inverse, points):
+    """Coordinates in the unit box of a batch's positions, (3, `POINTS`); lanes behind ``last`` repeat it."""
+    for p in range(POINTS):
+        i = min(start + p, last)
+        for axis in range(3):
+            points[axis, p] = (position[i, axis] - lo[axis]) * inverse[axis]
 
 
 @parallel
@@ -77,7 +91,7 @@ def values_at(position, box, table, levels, octaves, net, widest, settings, jobs
         table: features, flat.
         levels: see `levels_of`.
         octaves: number of octaves behind the coordinates, -1 for none.
-        net: layers and sizes as `pack_network` returns them; its inputs are the grid's features, then what `coordinates` says.
+        net: layers and sizes as `pack_network` returns them; its inputs are the features, then what `coordinates` writes.
         widest: largest number of inputs or outputs of any layer.
         settings: sharpness, scale of the distance, scales of the coordinates.
         jobs: number of jobs.
@@ -92,11 +106,7 @@ def values_at(position, box, table, levels, octaves, net, widest, settings, jobs
         x, ping, pong = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
         for batch in range(job_start(batches, jobs, job), job_start(batches, jobs, job + 1)):
             start = batch * POINTS
-            for p in range(POINTS):
-                # The last batch's empty lanes repeat the last position.
-                i = min(start + p, n - 1)
-                for axis in range(3):
-                    points[axis, p] = (position[i, axis] - lo[axis]) * inverse[axis]
+            gather(position, start, n - 1, lo, inverse, points)
             encode(table, levels, points, entries, weights, x)
             coordinates(points, x, first, settings, octaves)
             raw = distances(net, x, ping, pong, settings[0])

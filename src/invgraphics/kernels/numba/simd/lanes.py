@@ -101,6 +101,8 @@ _define(max, lanes, (lanes, lanes), _select(">"))
 for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
     _define(_function, mask, (lanes, lanes), lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
 _define(operator.and_, mask, (mask, mask), lambda builder, a, b: builder.and_(a, b))
+_define(operator.or_, mask, (mask, mask), lambda builder, a, b: builder.or_(a, b))
+_define(operator.invert, mask, (mask,), lambda builder, a: builder.not_(a))
 
 
 def _place(context: Any, builder: Any, kind: Any, flat: Any, at: Any) -> Any:
