@@ -11,6 +11,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, build_plan
 from invgraphics.recipes.recipe import Method, load_method, resolve
 from invgraphics.runs import checkpoint
+from invgraphics.testing import toy_scene
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 from invgraphics.training.losses import BackgroundEntropyLoss, PointColourLoss
@@ -184,6 +185,19 @@ def test_the_tight_box_resumes_to_the_bit_and_restarts(scene, tmp_path):
     assert float(sizes.prod()) ** (1 / 3) == pytest.approx(18, rel=0.05)
     voxels = (field.hi - field.lo) / sizes
     assert float(voxels.max() / voxels.min()) < 1.15
+
+
+def test_contracted_space_is_not_cropped_but_refined():
+    scene = toy_scene(views=3, size=12, space="contracted")
+    fit = fit_of(scene, 8, {"type": "tight_box", "at": 0.5, "threshold": 0.5, "resolution": 15})
+    with torch.no_grad():
+        fit.model.field.encoding.lattices()[0].features[4:8, 3:9, 5:8] = 8.0
+    rates = []
+    fit.run(lambda loss: bool(rates.append(fit._optimiser.rates()["density"])))
+    field = fit.model.field
+    assert torch.equal(field.lo, scene.bounds.lo) and torch.equal(field.hi, scene.bounds.hi)
+    assert [encoding.resolution for encoding in field.lattice_encodings().values()] == [(15, 15, 15)] * 2
+    assert rates[3] < rates[0] and max(rates[4:]) > rates[3]  # restarted
 
 
 def test_bad_settings_and_fields_are_refused(scene):

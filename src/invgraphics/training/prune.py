@@ -123,12 +123,10 @@ def heaviest(unit: Float[Tensor, "m 3"], weights: Float[Tensor, " m"], resolutio
     inside = ((unit >= 0) & (unit <= 1)).all(dim=1)
     unit, weights = unit[inside], weights[inside]
     cells = torch.tensor(resolution, device=unit.device) - 1
-    base = torch.minimum((unit * cells).long(), cells - 1)
-    found = weights.new_zeros(tuple(resolution)).flatten()
-    for corner in torch.cartesian_prod(*[torch.arange(2, device=unit.device)] * 3):
-        x, y, z = (base + corner).unbind(dim=1)
-        found.scatter_reduce_(0, (x * resolution[1] + y) * resolution[2] + z, weights, reduce="amax")
-    return found.reshape(tuple(resolution))
+    x, y, z = torch.minimum((unit * cells).long(), cells - 1).unbind(dim=1)
+    found = weights.new_zeros([size - 1 for size in resolution])
+    found.view(-1).scatter_reduce_(0, (x * found.shape[1] + y) * found.shape[2] + z, weights, reduce="amax")
+    return max_pool3d(found[None, None], 2, stride=1, padding=1)[0, 0]  # of up to eight cells around a vertex
 
 
 def dilated(mask: Bool[Tensor, "x y z"], by: int) -> Bool[Tensor, "x y z"]:

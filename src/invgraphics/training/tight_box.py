@@ -16,12 +16,14 @@ from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook
 from invgraphics.training.penalties import LATTICES
-from invgraphics.training.upsample import Moments, change_lattices
+from invgraphics.training.upsample import Moments, change_lattices, resize_lattices
 
 
 @dataclass(frozen=True)
 class TightBoxConfig:
     """One move of a field's region to the bounding box of all voxels that are not empty (DVGO, Sun et al. 2022).
+
+    Contracted space, whose outer voxels reach to infinity, stays whole: there only resolution, moments and rates change.
 
     Attributes:
         at: progress at which it happens.
@@ -73,12 +75,15 @@ class TightBox(MilestoneHook):
     def act(self, state: FitState, due: int) -> None:
         field, config = cast(LatticeField, state.field), self._config
         x, y, z = field.lattice_encodings()["geometry"].resolution
-        box = occupied_box(state.field, field.bounds, (x, y, z), config.threshold, state.ctx.chunk)
-        if box is None:
-            return
-        lo, hi = enlarged(box, config.scale, field.bounds)
         resolution = config.resolution or (x * y * z) ** (1 / 3)
-        change_lattices(state, partial(field.crop, lo, hi, resolution), config.moments)
+        if field.bounds.space == "box":
+            box = occupied_box(state.field, field.bounds, (x, y, z), config.threshold, state.ctx.chunk)
+            if box is None:
+                return
+            change = partial(field.crop, *enlarged(box, config.scale, field.bounds), resolution)
+        else:
+            change = partial(resize_lattices, field, [resolution] * len(field.lattice_encodings()))
+        change_lattices(state, change, config.moments)
         if config.restart_rates:
             state.optimiser.restart(state.ctx.progress)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, cast
@@ -86,10 +86,9 @@ class Upsample(MilestoneHook):
     def act(self, state: FitState, due: int) -> None:
         config = self._config
         field = cast(LatticeField, state.field)
-        edges = field.bounds.half.tolist()
         limit = pixel_limit(field.bounds, state.cameras()) / config.min_spacing if config.min_spacing else math.inf
-        sizes = [(encoding, self._next(encoding, due, limit)) for encoding in field.lattice_encodings().values()]
-        change_lattices(state, partial(_resize, sizes, edges), config.moments)
+        sizes = [self._next(encoding, due, limit) for encoding in field.lattice_encodings().values()]
+        change_lattices(state, partial(resize_lattices, field, sizes), config.moments)
         if config.restart_rates:
             state.optimiser.restart(state.ctx.progress)
 
@@ -103,8 +102,10 @@ class Upsample(MilestoneHook):
         return now ** (1 - share) * min(self._config.resolution, limit) ** share
 
 
-def _resize(sizes: list[tuple[LatticeEncoding, float]], edges: list[float]) -> None:
-    for encoding, resolution in sizes:
+def resize_lattices(field: LatticeField, resolutions: Sequence[float]) -> None:
+    """Interpolate each encoding at so many vertices along the edges of a cube of as many voxels, about cubic in the region."""
+    edges = field.bounds.half.tolist()
+    for encoding, resolution in zip(field.lattice_encodings().values(), resolutions, strict=True):
         encoding.resize(vertices_along(resolution, edges))
 
 
