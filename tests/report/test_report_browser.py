@@ -78,11 +78,38 @@ def test_page_is_quiet_and_asks_no_network(opened: Any, either: Path) -> None:
     assert all(url.startswith(("file:", "data:")) for url in page.heard["requests"])
 
 
+LOADED = """async () => {
+  for (const image of document.images) image.loading = 'eager';
+  await Promise.allSettled([...document.images].map(image => image.decode()));
+  return [...document.images].map(image => [image.getAttribute('src'), image.naturalWidth]);
+}"""
+
+
 def test_every_picture_has_size(opened: Any, either: Path) -> None:
     page = opened(either)
-    sizes = page.evaluate("[...document.images].map(image => [image.getAttribute('src'), image.naturalWidth])")
+    sizes = page.evaluate(LOADED)
     assert len(sizes) > 60
     assert [source for source, width in sizes if not width] == []
+
+
+def test_pictures_load_when_they_are_looked_at(opened: Any, either: Path) -> None:
+    page = opened(either, viewport={"width": 1280, "height": 900})
+    views = page.locator(".gallery").first.locator(".view")
+    assert views.count() > 1
+    hidden = views.nth(1)
+    widths = "view => [...view.querySelectorAll('img')].map(image => image.naturalWidth)"
+    assert set(hidden.evaluate(widths)) == {0}
+    page.locator(f"nav.views a[href='#{hidden.get_attribute('id')}']").first.click()
+    hidden.locator("img").first.scroll_into_view_if_needed()
+    page.wait_for_function("image => image.naturalWidth > 0", arg=hidden.locator("img").first.element_handle(), timeout=10_000)
+
+
+def test_printing_loads_all_pictures(opened: Any, built_report: Path) -> None:
+    page = opened(built_report)
+    views = page.locator(".view img")
+    sources = {views.nth(k).get_attribute("src") for k in range(views.count())}
+    # Skia writes a picture that is used several times once, and its objects' dictionaries are not compressed.
+    assert len(re.findall(rb"/Subtype /Image", page.pdf())) >= len(sources)
 
 
 def test_every_link_resolves(opened: Any, either: Path) -> None:
