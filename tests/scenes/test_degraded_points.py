@@ -173,3 +173,20 @@ def test_points_are_cached_by_what_they_are_made_of(plane: Scene, monkeypatch: p
     assert torch.equal(first.points.position, again.points.position) and torch.equal(first.points.rgb, again.points.rgb)
     assert len(first.observed) == len(again.observed) == CAMERAS
     assert all(torch.equal(*rows) for rows in zip(first.observed, again.observed, strict=True))
+
+
+def test_a_triangulation_of_many_photographs_is_announced_once(
+    plane: Scene, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    found = sfm.Triangulated.of(Points(torch.rand(9, 3), torch.rand(9, 3)), torch.zeros(2, 0, dtype=torch.int64), CAMERAS)
+    monkeypatch.setattr(sfm, "triangulate", lambda scene: found)
+    sfm.triangulated(plane)
+    assert capsys.readouterr().err == ""
+    next(tmp_path.rglob("points/*.npz")).unlink()
+    monkeypatch.setattr(sfm, "MANY", CAMERAS)
+    for expected in (
+        f"plane: finding points in {CAMERAS} training photographs (structure from motion); cached afterwards.\n",
+        "",
+    ):
+        sfm.triangulated(plane)
+        assert capsys.readouterr().err == expected

@@ -7,6 +7,7 @@ views know nothing of those that were left out.
 from __future__ import annotations
 
 import hashlib
+import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ NEIGHBOURS = 20
 """A photograph is matched with as many of its nearest, by position and direction of the camera."""
 LONGEST_TRACK_ERROR = 2.0
 """Largest reprojection error of a point, px."""
+MANY = 20
+"""Number of photographs from which on a triangulation is announced: 60 of 200 px take a minute and a half of two busy cores."""
 SCHEMA = 2
 """Rises where the same photographs give other points, or more is known of them."""
 DATABASE, PHOTOS, PAIRS = "features.db", "photos", "pairs.txt"
@@ -60,7 +63,10 @@ class Triangulated:
 
 
 def triangulated(scene: Scene) -> Triangulated:
-    """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else."""
+    """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else.
+
+    A triangulation of many photographs is announced on stderr.
+    """
     sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
     for view in scene.train:
         for values in (view.camera.cam_to_world, view.camera.focal, view.camera.principal_point):
@@ -75,6 +81,9 @@ def triangulated(scene: Scene) -> Triangulated:
             return Triangulated.of(Points(position, rgb), tracks, len(scene.train))
     except (InputError, OSError, KeyError):  # no cache, or what is in it is damaged
         return triangulate(scene)
+    if len(scene.train) >= MANY:
+        what = f"{scene.name}: finding points in {len(scene.train)} training photographs (structure from motion)"
+        print(f"{what}; cached afterwards.", file=sys.stderr, flush=True)
     found = triangulate(scene)
     write_arrays(path, found.arrays())
     return found
