@@ -103,18 +103,19 @@ def test_looking_around_imports_nothing_heavy(arguments: list[str]) -> None:
 
 
 def test_list_answers_at_once() -> None:
-    """At most six times the processor time of importing what every command needs (it is two to three; torch alone is 15)."""
+    """At most six times the processor time of importing what every command needs (it is three to four; torch alone is 15).
+
+    The two are measured in turns, so that a machine that is busy for a while slows both.
+    """
 
     def seconds(*arguments: str) -> float:
-        spent = []
-        for _ in range(3):
-            before = os.times()
-            subprocess.run([sys.executable, *arguments], capture_output=True, timeout=60, check=True)
-            after = os.times()
-            spent.append(after.children_user + after.children_system - before.children_user - before.children_system)
-        return min(spent)
+        before = os.times()
+        subprocess.run([sys.executable, *arguments], capture_output=True, timeout=60, check=True)
+        after = os.times()
+        return after.children_user + after.children_system - before.children_user - before.children_system
 
-    assert seconds("-m", "invgraphics", "list") < 6 * seconds("-c", "import tyro, rich.table")
+    turns = [(seconds("-m", "invgraphics", "list"), seconds("-c", "import tyro, rich.table")) for _ in range(5)]
+    assert min(answer for answer, _ in turns) < 6 * min(imports for _, imports in turns)
 
 
 def test_list_names_everything_that_is_registered() -> None:

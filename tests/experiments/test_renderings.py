@@ -86,11 +86,12 @@ def test_a_rendering_is_the_fitted_field_through_that_renderer(run: Path, toy_fo
     scene = open_scene(str(toy_folder), SceneOptions(test_views=16))
     field = build_model(load_method(METHOD, None, SMALL[METHOD]), scene, 0, torch.device("cpu")).field
     field.load_state_dict(checkpoint.load(run / CHECKPOINT)["field"])
+    kernels.use("reference")  # as in the fit: implementations may differ by a Gaussian at the limit of 1/255
     with torch.no_grad():
         renderer = GaussianSorted(GaussianSortedConfig("splat"))
         picture, _ = renderer.render_image(field, scene.test[1].camera, Context(scene.bounds))
     with np.load(run / _record(run)["renderings"][1]["run"] / "test" / "0001.npz") as kept:
-        np.testing.assert_allclose(kept["rgb"], picture.rgb.numpy(), atol=1e-3)
+        np.testing.assert_allclose(kept["rgb"], picture.rgb.numpy(), atol=2**-11)  # half floats
 
 
 def test_a_rendering_is_a_run_that_knows_what_it_shows(run: Path) -> None:
