@@ -57,6 +57,14 @@ def test_a_tight_box_of_what_has_no_grid_or_no_density_is_refused_before_the_fir
         TightBoxConfig(at=0.5).build().check_fit(Distance(0, 1), plan.model.renderer)
 
 
+def test_a_tight_box_with_colour_of_a_hash_grid_is_refused_in_a_box_before_the_first_step(scene):
+    dvgo = load_method("volumetric/dvgo").table
+    field = dvgo["field"] | {"encoding": {"type": "voxels", "resolution": 9}, "appearance": {"type": "hash"}}
+    plan = build_plan(resolve("mine", "", dvgo | {"field": field}), scene, Budget(steps=9), 0, torch.device("cpu"))
+    with pytest.raises(InputError, match="which the appearance's is not"):
+        Fit(plan)
+
+
 def test_vertices_of_a_grid_lie_in_the_order_of_memory():
     found = BOUNDS.vertices((3, 2, 5)).reshape(3, 2, 5, 3)
     torch.testing.assert_close(found[1, 0, 3], torch.tensor([0.0, -2.0, 0.75]))

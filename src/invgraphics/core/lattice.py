@@ -213,6 +213,11 @@ class LatticeField(Protocol):
         """Encodings made of lattices by what is read from them; empty where there is none."""
         ...
 
+    @property
+    def croppable(self) -> bool:
+        """Whether the region is a box and all encodings are lattices, as `crop` needs."""
+        ...
+
     def crop(self, lo: Float[Tensor, 3], hi: Float[Tensor, 3], resolution: float) -> None:
         """Move the region to the box [lo, hi] and interpolate the lattices there; nothing is left outside.
 
@@ -222,6 +227,6 @@ class LatticeField(Protocol):
             resolution: vertices of the finest lattices along the edges of a cube of as many voxels.
 
         Raises:
-            InputError: the region is no box, or an encoding is not made of lattices.
+            InputError: it is not `croppable`.
         """
         ...

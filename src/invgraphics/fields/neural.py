@@ -139,6 +139,11 @@ class NeuralField(Field):
         encodings: dict[Role, Encoding | None] = {"geometry": self.encoding, "appearance": self.appearance}
         return {role: encoding for role, encoding in encodings.items() if isinstance(encoding, LatticeEncoding)}
 
+    @property
+    def croppable(self) -> bool:
+        """See `core.lattice.LatticeField`."""
+        return self._space == "box" and len(self.lattice_encodings()) == 1 + (self.appearance is not None)
+
     @torch.no_grad()
     def crop(self, lo: Float[Tensor, 3], hi: Float[Tensor, 3], resolution: float) -> None:
         """See `core.lattice.LatticeField`; densities inside the new box stay what they are."""

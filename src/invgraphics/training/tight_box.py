@@ -66,10 +66,14 @@ class TightBox(MilestoneHook):
 
     @override
     def check_fit(self, field: Field, renderer: Renderer) -> None:
-        if "geometry" not in cast(LatticeField, field).lattice_encodings():
+        lattices = cast(LatticeField, field)
+        if "geometry" not in lattices.lattice_encodings():
             raise InputError(f"The hook '{self.name}' needs a geometry made of lattices, which this field does not have.")
         if Quantity.DENSITY not in field.provides:
             raise InputError(f"The hook '{self.name}' needs a density, which {type(field).__name__} does not have.")
+        if lattices.bounds.space == "box" and not lattices.croppable:
+            sentence = f"The hook '{self.name}' crops encodings made of lattices, which the appearance's is not."
+            raise InputError(sentence, "Choose another field.appearance.type, or leave the hook out.")
 
     @override
     def act(self, state: FitState, due: int) -> None:
