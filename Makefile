@@ -45,7 +45,7 @@ test-triton: env  ## install triton (0.6 GB) and test the GPU's kernels without 
 
 test-notebooks: env  ## every notebook at a small size, and the numbers it prints
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"
-	$(BIN)/python -m pytest -m slow tests/notebooks
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow tests/notebooks
 
 fuzz: env  ## 5000 damaged inputs of every reader; INVGRAPHICS_FUZZ_SEED repeats those of a day
 	INVGRAPHICS_FUZZ=$${INVGRAPHICS_FUZZ:-5000} $(BIN)/python -m pytest -s tests/fuzz

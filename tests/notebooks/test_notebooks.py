@@ -416,6 +416,7 @@ HEADLINES: dict[str, Callable[[_Printed], None]] = dict(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs_and_its_headline_numbers_hold(path: Path, render: ModuleType, tmp_path: Path) -> None:
     notebook = render.execute(path, SMALL[path.stem], folder=tmp_path)

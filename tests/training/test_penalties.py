@@ -31,6 +31,7 @@ class Grids(Field):
     """A field of given lattices and of constant density."""
 
     provides = Quantity.DENSITY
+    croppable = False
 
     def __init__(self, density=0.0, **lattices) -> None:
         super().__init__()
