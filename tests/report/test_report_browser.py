@@ -108,6 +108,9 @@ def test_printing_loads_all_pictures(opened: Any, built_report: Path) -> None:
     page = opened(built_report)
     views = page.locator(".view img")
     sources = {views.nth(k).get_attribute("src") for k in range(views.count())}
+    # A browser without a screen prints what has arrived; one that somebody prints from waits.
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    page.wait_for_function("[...document.images].every(image => image.naturalWidth > 0)", timeout=60_000)
     # Skia writes a picture that is used several times once, and its objects' dictionaries are not compressed.
     assert len(re.findall(rb"/Subtype /Image", page.pdf())) >= len(sources)
 

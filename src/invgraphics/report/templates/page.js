@@ -176,9 +176,10 @@
     });
   }
 
-  // On paper everything is open.
+  // On paper everything is open, and every picture is there.
   const folded = new Set();
   addEventListener("beforeprint", () => {
+    for (const image of document.images) image.loading = "eager";
     for (const details of document.querySelectorAll("details:not([open])")) folded.add(details);
     for (const details of folded) details.open = true;
   });
