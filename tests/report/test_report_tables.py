@@ -277,7 +277,9 @@ def test_methods_without_points_do_not_say_what_others_start_from(comparison_fol
         field, sampler = ('type = "neural"', "coarse = 32") if run in nerf else ('init = "scene"', "")
         (run.folder / "recipe.toml").write_text(f"[field]\n{field}\n[renderer]\nsampler = {{ {sampler} }}\n")
     assert start_fact(runs) == "from SfM"
-    assert start_fact(nerf) == "exact ones"
+    assert start_fact(nerf) == "not used: no method here starts from points"
+    supervised = [replace(run, provenance=replace(run.provenance, sparse_depth="9 rays end at points")) for run in nerf]
+    assert start_fact(supervised) == "exact ones; rays of volumetric/nerf end there"
     for run in nerf:  # an occupancy grid that points seed
         (run.folder / "recipe.toml").write_text('[field]\ntype = "neural"\n[renderer]\nsampler = { points_until = 0.1 }\n')
     assert start_fact(runs).count("(") == 2

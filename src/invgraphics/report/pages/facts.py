@@ -37,6 +37,8 @@ START_WORDS = {
     "field": "another run's field",
 }
 """``field.init`` of a recipe that does not start from the scene's points -> words."""
+UNUSED = "not used: no method here starts from points"
+"""The fact where a scene has points that no fit used."""
 
 
 @dataclass(frozen=True)
@@ -120,14 +122,18 @@ def _chosen_on(runs: Sequence[Run]) -> str:
 def start_fact(runs: Sequence[Run]) -> str:
     """What the fits' fields may start from, by scene or by method where these differ, and whose rays end at these points.
 
-    Of methods that start from no points, the scene's points are told only where there are no others. Empty where no run says.
+    The scene's points are named where a method uses them, or may: a run without a recipe does not say. Empty where no run says.
     """
     recipes = [_recipe(run) for run in runs]
     own = [(START_WORDS.get(_init(recipe), ""), run) for recipe, run in zip(recipes, runs, strict=True)]
     others = [(recipe, run) for recipe, (words, run) in zip(recipes, own, strict=True) if not words]
-    users = [(recipe, run) for recipe, run in others if not recipe or starts_from_points(recipe)]
-    scenes = [(_start(run), run.scores.scene) for _, run in users or others]
+    users = [
+        run for recipe, run in others if "field" not in recipe or starts_from_points(recipe) or run.provenance.sparse_depth
+    ]
+    scenes = [(_start(run), run.scores.scene) for run in users]
     starts = [grouped([(start or "none", scene) for start, scene in scenes])] if any(start for start, _ in scenes) else []
+    if not users and len(others) == len(runs) and any(_start(run) for run in runs):
+        starts = [UNUSED]
     for words in dict.fromkeys(words for words, _ in own if words):
         methods = list(dict.fromkeys(run.scores.method for each, run in own if each == words))
         starts.append(words if all(each == words for each, _ in own) else f"{words} ({listing(methods)})")
