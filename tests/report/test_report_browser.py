@@ -101,7 +101,7 @@ def test_pictures_load_when_they_are_looked_at(opened: Any, either: Path) -> Non
     assert set(hidden.evaluate(widths)) == {0}
     page.locator(f"nav.views a[href='#{hidden.get_attribute('id')}']").first.click()
     hidden.locator("img").first.scroll_into_view_if_needed()
-    page.wait_for_function("image => image.naturalWidth > 0", arg=hidden.locator("img").first.element_handle(), timeout=10_000)
+    page.wait_for_function("image => image.naturalWidth > 0", arg=hidden.locator("img").first.element_handle(), timeout=60_000)
 
 
 def test_printing_loads_all_pictures(opened: Any, built_report: Path) -> None:
