@@ -147,8 +147,7 @@ class NeuralField(Field):
     @torch.no_grad()
     def crop(self, lo: Float[Tensor, 3], hi: Float[Tensor, 3], resolution: float) -> None:
         """See `core.lattice.LatticeField`; densities inside the new box stay what they are."""
-        encodings = [self.encoding] if self.appearance is None else [self.encoding, self.appearance]
-        crop_lattices(encodings, self.bounds, (lo, hi), resolution)
+        crop_lattices(self, lo, hi, resolution)
         self.lo.copy_(lo)
         self.hi.copy_(hi)
 

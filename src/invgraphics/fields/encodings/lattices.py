@@ -13,9 +13,8 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core.bounds import Bounds
 from invgraphics.core.field import Encoding
-from invgraphics.core.lattice import CORNER, ORIGIN, Combination, Lattice, LatticeEncoding, resampled, vertices_along
+from invgraphics.core.lattice import CORNER, ORIGIN, Combination, Lattice, LatticeField, resampled, vertices_along
 from invgraphics.errors import InputError
 
 CUBE = (1.0, 1.0, 1.0)
@@ -134,17 +133,14 @@ class LatticeFeatures(Encoding):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
-def crop_lattices(
-    encodings: Sequence[Encoding], bounds: Bounds, corners: tuple[Float[Tensor, 3], Float[Tensor, 3]], resolution: float
-) -> None:
-    """Interpolate encodings of ``bounds`` at the vertices of the box between ``corners``; see `core.lattice.LatticeField.crop`.
+def crop_lattices(field: LatticeField, lo: Float[Tensor, 3], hi: Float[Tensor, 3], resolution: float) -> None:
+    """Interpolate a field's encodings at the vertices of the box [lo, hi]; see `core.lattice.LatticeField.crop`.
 
     Raises:
-        InputError: the region is no box, or an encoding is not made of lattices.
+        InputError: the field is not `croppable`.
     """
-    grids = [encoding for encoding in encodings if isinstance(encoding, LatticeEncoding)]
-    if bounds.space != "box" or len(grids) < len(encodings):
+    if not field.croppable:
         raise InputError("Only a field in a box, whose encodings are all lattices, can be cropped.")
-    lo, hi = (bounds.to_unit(corner).tolist() for corner in corners)
-    for grid in grids:
-        grid.resize(vertices_along(resolution, (corners[1] - corners[0]).tolist()), lo, hi)
+    corners = field.bounds.to_unit(lo).tolist(), field.bounds.to_unit(hi).tolist()
+    for encoding in field.lattice_encodings().values():
+        encoding.resize(vertices_along(resolution, (hi - lo).tolist()), *corners)

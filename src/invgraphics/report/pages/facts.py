@@ -132,11 +132,11 @@ def start_fact(runs: Sequence[Run]) -> str:
     ]
     scenes = [(_start(run), run.scores.scene) for run in users]
     starts = [grouped([(start or "none", scene) for start, scene in scenes])] if any(start for start, _ in scenes) else []
-    if not users and len(others) == len(runs) and any(_start(run) for run in runs):
-        starts = [UNUSED]
     for words in dict.fromkeys(words for words, _ in own if words):
         methods = list(dict.fromkeys(run.scores.method for each, run in own if each == words))
         starts.append(words if all(each == words for each, _ in own) else f"{words} ({listing(methods)})")
+    if not (users or starts) and any(_start(run) for run in runs):
+        starts.append(UNUSED)
     if supervised := list(dict.fromkeys(run.scores.method for run in runs if run.provenance.sparse_depth)):
         starts.append(f"rays of {listing(supervised)} end there")
     return "; ".join(starts)
