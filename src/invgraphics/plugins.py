@@ -132,8 +132,8 @@ def load(registry: str, name: str) -> Any:
         source = origin(registry, name)
         if source == "built in" and not isinstance(error, ImportError | AttributeError):
             raise
-        said = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
-        raise InputError(f"'{name}' of the {registry} ({target}, {source}) cannot be imported: {said}.") from error
+        cause = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
+        raise InputError(f"'{name}' of the {registry} ({target}, {source}) cannot be imported: {cause}.") from error
 
 
 def load_all(registry: str, known: Iterable[str] | None = None) -> Iterator[tuple[str, Any]]:

@@ -116,7 +116,7 @@ def inline_toml(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Convert numpy scalars and arrays, tensors and paths within tables and lists to the plain values that TOML knows.
+    """Convert numpy scalars and arrays, tensors and paths within tables and lists to the plain values that TOML has.
 
     Raises:
         ValueError: TOML has no such value.

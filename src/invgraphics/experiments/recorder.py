@@ -94,7 +94,7 @@ class Recorder:
         title: of the progress display.
         snapshots: how many states of the model to keep, evenly over the fit, besides the first.
         on_step: is given the fit before its first step and after each one, on no clock.
-        memory: peak of the fit, saved with each checkpoint; ``None`` where nobody measures it.
+        memory: peak of the fit, saved with each checkpoint; ``None`` where it is not measured.
 
     Attributes:
         history: each evaluation by the monitor.

@@ -1,6 +1,6 @@
 """Cross-rendering of a fitted field by other renderers, which separates effects of representation and renderer.
 
-A rendering is a run folder without a fit, ``RUN/rendered/NAME``; it knows the run whose checkpoint it shows. The run holds what
+A rendering is a run folder without a fit, ``RUN/rendered/NAME``; it names the run whose checkpoint it shows. The run holds what
 the pictures of one fit differ in (`invgraphics.runs.renderings`).
 """
 

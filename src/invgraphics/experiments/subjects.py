@@ -36,7 +36,7 @@ def check_subjects(field: Field, renderer: Renderer, scene: Scene, method: str) 
         )
     if conditional and any(isinstance(part, OccupancyGridSampler) for part in renderer.modules()):
         raise InputError(
-            f"{method} shows many subjects, and an occupancy grid knows the empty space of one.",
+            f"{method} shows many subjects, and an occupancy grid holds the empty space of one.",
             "Choose another sampler, such as renderer.sampler.type = 'stratified'.",
         )
 

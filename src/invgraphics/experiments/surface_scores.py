@@ -86,7 +86,7 @@ def mesh_scores(mesh: Mesh, scene: Scene) -> Scored:
 
 
 def _dtu_scores(mesh: Mesh, scene: Scene, scan: Scan) -> Scored:
-    """Scores by DTU's rule, in the data set's millimetres; it knows neither an F-score nor normals."""
+    """Scores by DTU's rule, in the data set's millimetres; it has neither an F-score nor normals."""
     rule = f"DTU's rule, {scene.notes.get('reference_scan', '')}".rstrip(", ")
     try:
         found = dtu_score(mesh.transformed(scene.world_from_local), scan)

@@ -21,7 +21,7 @@ EPS = 1e-4
 POINT_SHARE = 1e-3
 """Share of the scene's points that may lie before the nearest plane, and behind the farthest."""
 FAR_RATIO = 100.0
-"""Farthest over nearest depth where the scene knows neither points nor a box (Zhou et al. 2018: planes from 1 to 100)."""
+"""Farthest over nearest depth where the scene has neither points nor a box (Zhou et al. 2018: planes from 1 to 100)."""
 BASIS_OCTAVES = 3
 
 

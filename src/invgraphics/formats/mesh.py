@@ -43,7 +43,7 @@ def write_mesh(path: Path, mesh: Mesh, rgb: Float[Tensor, "v 3"], comments: Sequ
     """Write a mesh whole or not at all; the format is that of the file's name.
 
     PLY has 8-bit colours and the comments, OBJ decimal colours behind the positions (as MeshLab and Blender read them), GLB
-    linear float colours, as glTF wants them, and an unlit material: the colours are radiance, which no lamp lights again.
+    linear float colours, as glTF requires, and an unlit material: the colours are radiance, which no lamp lights again.
 
     Args:
         path: the file.

@@ -215,7 +215,7 @@ def _unzstd(path: Path, data: bytes, size: int) -> bytes:
 
 
 def _axes(path: Path, extensions: bytes) -> str:
-    """The axes that an extension names; extensions that are not known are skipped, as the format wants it."""
+    """The axes that an extension names; extensions that are not known are skipped, as the format requires."""
     for kind, payload in _records(path, extensions):
         code = int.from_bytes(payload[:4], "little")
         if kind == AXES_EXTENSION and 1 <= code <= len(AXES_CODES):

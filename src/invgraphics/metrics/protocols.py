@@ -42,7 +42,7 @@ def protocol_named(name: str) -> Protocol:
     """Look up one of our own protocols.
 
     Raises:
-        InputError: unknown name, the known ones are listed; or the name of another tool's, which only rescoring knows.
+        InputError: unknown name, the known ones are listed; or the name of another tool's, which only rescoring takes.
     """
     own = [known for known, protocol in PROTOCOLS.items() if not protocol.source]
     if name not in PROTOCOLS:
@@ -66,7 +66,7 @@ def prepare(rendering: Rendering, view: View, scene: Scene, protocol: Protocol) 
 
     Raises:
         InputError: prediction and truth differ in size, or the crop leaves nothing.
-        Skip: the prediction's colour or alpha is not finite somewhere, or the view has a mask and the protocol knows none.
+        Skip: the prediction's colour or alpha is not finite somewhere, or the view has a mask and the protocol supports none.
     """
     height, width = view.image.shape[:2]
     if tuple(rendering.alpha.shape) != (height, width):

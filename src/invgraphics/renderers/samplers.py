@@ -159,8 +159,8 @@ def stratified_edges(
 ) -> Float[Tensor, "k edges"]:
     """``count + 1`` edges from near to far in spacing coordinates; in training the inner ones move by up to half a stratum.
 
-    Fields are asked in the middle of two edges, which lies in the stratum's own middle more often than at its ends; NeRF's
-    points (equation 2) are uniform in it.
+    Fields are queried halfway between two edges, which is denser in the middle of a stratum than at its ends; NeRF's points
+    (equation 2) are uniform in it.
     """
     of_ray = None if transition is None else transition[:, 0]
     near, far = to_spacing(rays.near, ctx.bounds, of_ray), to_spacing(rays.far, ctx.bounds, of_ray)

@@ -134,8 +134,8 @@ def _named(groups: Sequence[list[Run]]) -> Iterator[tuple[list[Run], str]]:
         [group[0].provenance.budget for group in groups],
         [_shortest_suffix(folder, folders) for folder in folders],
     )
-    told = next(words for words in details if len(set(words)) == len(groups))
-    for group, words in zip(groups, told, strict=True):
+    distinct = next(words for words in details if len(set(words)) == len(groups))
+    for group, words in zip(groups, distinct, strict=True):
         yield group, method if len(groups) == 1 else f"{method} ({words})"
 
 

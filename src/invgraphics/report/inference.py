@@ -160,8 +160,8 @@ def _normals_words(record: Inference, observed: int, pair: tuple[str, str]) -> s
 
 def _lost_words(pair: tuple[str, str], lacks: tuple[int, int]) -> str:
     """Say which of two methods lacks scores of how many instances that the other one has."""
-    told = [f"{name} lacks scores of {_instances(count)}" for name, count in zip(pair, lacks, strict=True) if count]
-    return " and ".join(told)
+    sentences = [f"{name} lacks scores of {_instances(count)}" for name, count in zip(pair, lacks, strict=True) if count]
+    return " and ".join(sentences)
 
 
 def _instances(count: int) -> str:

@@ -68,7 +68,7 @@ class Split:
         train: to fit.
         test: to score.
         val: to monitor during a fit.
-        rule: how they were told apart, for the scene's notes.
+        rule: how the splits were determined, for the scene's notes.
     """
 
     train: Sequence[Photo]

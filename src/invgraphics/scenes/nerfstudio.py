@@ -39,9 +39,9 @@ class Nerfstudio:
         listed = frames.photos()
         photos, notes = existing_photos(listed, source)
         notes["loader"] = "nerfstudio"
-        points, said = _known_points(frames)
+        points, points_note = _known_points(frames)
         split = _own_split(frames, listed, photos) or every_eighth(photos)
-        return compose(scene_name(source.parent), split, photo_frame(photos, points), options, notes | said)
+        return compose(scene_name(source.parent), split, photo_frame(photos, points), options, notes | points_note)
 
 
 def _known_points(frames: Frames) -> tuple[Points | None, dict[str, str]]:

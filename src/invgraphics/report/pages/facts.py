@@ -115,8 +115,10 @@ def preset_facts(runs: Sequence[Run], stated: str = "") -> dict[str, str]:
 
 def _chosen_on(runs: Sequence[Run]) -> str:
     """Scenes on which presets were chosen, by method; those whose recipe does not say are listed where another's does."""
-    told = [(_text(run.provenance.preset_chosen_on), run.method) for run in runs]
-    return grouped([(scenes or "not stated", method) for scenes, method in told]) if any(scenes for scenes, _ in told) else ""
+    chosen = [(_text(run.provenance.preset_chosen_on), run.method) for run in runs]
+    if not any(scenes for scenes, _ in chosen):
+        return ""
+    return grouped([(scenes or "not stated", method) for scenes, method in chosen])
 
 
 def start_fact(runs: Sequence[Run]) -> str:
@@ -144,8 +146,10 @@ def start_fact(runs: Sequence[Run]) -> str:
 
 def region_fact(runs: Sequence[Run]) -> str:
     """The box in which fits sought their scene, without its share, which depends on the views; empty for the data set's."""
-    told = [(re.sub(r", \d+% of.*", "", str(run.provenance.notes.get("region", ""))), run.scores.scene) for run in runs]
-    return grouped([(words or "the data set's box", scene) for words, scene in told]) if any(words for words, _ in told) else ""
+    regions = [(re.sub(r", \d+% of.*", "", str(run.provenance.notes.get("region", ""))), run.scores.scene) for run in runs]
+    if not any(words for words, _ in regions):
+        return ""
+    return grouped([(words or "the data set's box", scene) for words, scene in regions])
 
 
 def _recipe(run: Run) -> Mapping[str, Any]:

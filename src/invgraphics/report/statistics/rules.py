@@ -177,7 +177,7 @@ def _verdict(rule: str, broken: bool, sentence: str, value: float, limit: float)
 
 
 def _budget(cell: StudyCell, alike: Sequence[StudyCell]) -> Verdict:
-    """PSNR against the best of all shorter budgets, so that a fall and a later recovery are told apart."""
+    """PSNR against the best of all shorter budgets, so that a fall and a later recovery are distinguished."""
     own = psnr_of(cell)
     shorter = [
         (value, other)

@@ -11,7 +11,7 @@ from invgraphics.report.data.comparison import Comparison
 from invgraphics.runs.run import Run
 
 FINE_GRID = 0.5
-"""Looks of the monitor that are closer than this, in seconds, make a time that is told to a tenth."""
+"""Spacing of the monitor's evaluations, in seconds, below which times to a quality are printed to a tenth."""
 
 
 def span_to_reach(run: Run, level: float) -> tuple[float, float] | None:

@@ -143,8 +143,8 @@ def _lead_ratio(best: float, second: float, column: MeasuredQuantity) -> float:
 
 def unequal_start(runs: Sequence[Run]) -> list[str]:
     """A warning where methods with primitives may start from points that no method could have found, and others do not."""
-    told = [run for run in runs if EXACT_POINTS in str(run.provenance.notes.get("points", ""))]
-    explicit = {run.scores.method: None for run in told if run.scores.cost.get("primitives")}
+    exact = [run for run in runs if EXACT_POINTS in str(run.provenance.notes.get("points", ""))]
+    explicit = {run.scores.method: None for run in exact if run.scores.cost.get("primitives")}
     if not explicit or set(explicit) == {run.scores.method for run in runs}:
         return []
     names = listing(explicit)

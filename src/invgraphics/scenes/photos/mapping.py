@@ -67,7 +67,7 @@ def reconstruct(strategy: Strategy, matched: Matched, progress: Progress) -> lis
 
 
 def _database(strategy: Strategy, matched: Matched, progress: Progress) -> Path:
-    """The data base as the strategy wants it."""
+    """The data base that the strategy needs."""
     from invgraphics.scenes.colmap_library import pycolmap
 
     path = matched.work / DATABASE

@@ -41,7 +41,7 @@ class Prepared:
         height: pixels.
         group: photographs with the same text share a camera.
         focal: focal length from EXIF or from the data set, pixels of the working copy.
-        centre: principal point, where the data set knows it.
+        centre: principal point, where the data set states it.
         masked: whether no features are looked for in parts of it: where it is transparent, or has a mask.
         own_mask: whether it has a mask, beside the photographs or of a data set, which the scene keeps.
     """
@@ -110,7 +110,7 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
 
 
 def _working_names(names: Sequence[str]) -> list[str]:
-    """PNG names told apart as simply as possible, of letters and digits that COLMAP's text files take for a name.
+    """Unique PNG names, as short as possible, of letters and digits that COLMAP's text files take for a name.
 
     They part words at spaces, and a line that begins with # is a comment.
     """

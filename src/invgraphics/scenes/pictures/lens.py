@@ -109,7 +109,7 @@ def straightening_obstacle(lens: Lens) -> str:
 
 def _inner_rectangle(camera: Any, width: int, height: int) -> tuple[float, float, float, float]:
     """Rectangle (left, right, top, bottom) on the plane z = 1 that the photograph covers."""
-    # Half a pixel inside the border, so that bilinear interpolation never asks for a pixel that is not there.
+    # Half a pixel inside the border, so that bilinear interpolation never reads a pixel outside.
     x, y = np.linspace(0.5, width - 0.5, 129), np.linspace(0.5, height - 0.5, 129)
     sides = [(np.full_like(y, x[0]), y), (np.full_like(y, x[-1]), y), (x, np.full_like(x, y[0])), (x, np.full_like(x, y[-1]))]
     limits, trusted = [], 0
