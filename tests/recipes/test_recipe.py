@@ -105,6 +105,7 @@ def test_a_cap_reaches_the_field_and_the_hooks_that_make_primitives() -> None:
 
 
 LATER_IN_BATCHES = ("foreground_until", "foreground_least", "start_size", "start_until")
+LATER_IN_OPTIMISER = ("muon", "muon_weight_decay")
 
 
 def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
@@ -120,7 +121,9 @@ def test_recipes_of_earlier_versions_open_under_the_same_digest() -> None:
         del table["batches"][key]
     for key in ("dropout", "dropout_views"):
         del table["field"][key]
-    del hook["reset_spacing"], hook["split_threshold"], table["optimiser"]["muon"]
+    del hook["reset_spacing"], hook["split_threshold"]
+    for key in LATER_IN_OPTIMISER:
+        del table["optimiser"][key]
     assert hook["share_opacity"] is True and hook["pace"] == 0.5 and hook["start_steps"] == 500
     again = resolve(method.name, "long", table)
     assert again.recipe == method.recipe and again.table == method.table
@@ -134,7 +137,8 @@ def test_keys_that_came_later_leave_the_digest_alone(preset: str) -> None:
     """While they have the values that change nothing; neural fields and the volumetric renderer had these keys first."""
     fields = "type encoding geometry layers width skip geometry_features colour_layers colour_width direction direction_degree"
     known = {*fields.split(), "density_activation", "density_bias", "density_per"}
-    unset = ["batches.foreground_least=0", "batches.foreground_until=1", "optimiser.muon=0"]
+    changed = ["batches.foreground_least=0", "batches.foreground_until=1"]
+    unset = [*changed, *(f"optimiser.{key}=0" for key in LATER_IN_OPTIMISER)]
     method = load_method("volumetric/nerf", preset, unset)
     table = copy.deepcopy(method.table)
     parts = [table["field"], *([table["renderer"]["sampler"]["proposal"]] if preset == "paper" else [])]
@@ -146,13 +150,15 @@ def test_keys_that_came_later_leave_the_digest_alone(preset: str) -> None:
         del table["renderer"][key]
     for key in LATER_IN_BATCHES:
         del table["batches"][key]
-    del table["optimiser"]["muon"]
+    for key in LATER_IN_OPTIMISER:
+        del table["optimiser"][key]
     assert resolve(method.name, preset, table).digest == method.digest
     text = json.dumps(table, sort_keys=True)
     assert method.digest == hashlib.sha256(text.encode()).hexdigest()
     assert load_method(method.name, preset, ["field.density_scale=2.0"]).digest != method.digest
     assert load_method(method.name, preset, ["renderer.colour_threshold=0.1"]).digest != method.digest
-    assert load_method(method.name, preset, ["optimiser.muon=1.0"]).digest != method.digest
+    for key in LATER_IN_OPTIMISER:
+        assert load_method(method.name, preset, [f"optimiser.{key}=1.0"]).digest != method.digest
     for key in LATER_IN_BATCHES:
         assert load_method(method.name, preset, [f"batches.{key}={0.3 if key != 'start_size' else 7}"]).digest != method.digest
 

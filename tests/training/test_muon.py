@@ -23,10 +23,10 @@ SHAPES = {
 GROUPS = {"field": GroupConfig("field", 1e-2, final=1e-3), "renderer": GroupConfig("renderer", 2e-2)}
 
 
-def made(muon: float) -> tuple[dict[str, torch.nn.Parameter], Optimiser]:
+def made(muon: float, decay: float = 0.0) -> tuple[dict[str, torch.nn.Parameter], Optimiser]:
     generator = torch.Generator().manual_seed(0)
     parameters = {name: torch.nn.Parameter(torch.randn(shape, generator=generator)) for name, shape in SHAPES.items()}
-    return parameters, Optimiser(OptimiserConfig(GROUPS, muon=muon), parameters, 1.0)
+    return parameters, Optimiser(OptimiserConfig(GROUPS, muon=muon, muon_weight_decay=decay), parameters, 1.0)
 
 
 def step(parameters: dict[str, torch.nn.Parameter], optimiser: Optimiser, seed: int) -> None:
@@ -46,12 +46,13 @@ def test_orthogonalised_keeps_singular_vectors_and_brings_values_to_about_one(sh
     assert float((inner - values.diag()).abs().max()) < 1e-4
 
 
-def test_steps_are_those_of_torchs_own_class() -> None:
+@pytest.mark.parametrize("decay", [0.0, 2.0])
+def test_steps_are_those_of_torchs_own_class(decay: float) -> None:
     """Up to bfloat16, in which torch's iterates; their scale is a whole-matrix factor, which it rounds too."""
     generator = torch.Generator().manual_seed(2)
     ours, theirs = (torch.nn.Parameter(torch.zeros(48, 24)) for _ in range(2))
-    muon = Muon([{"params": [ours], "lr": 0.05}])
-    judge = torch.optim.Muon([theirs], lr=0.05, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+    muon = Muon([{"params": [ours], "lr": 0.05}], weight_decay=decay)
+    judge = torch.optim.Muon([theirs], lr=0.05, weight_decay=decay, adjust_lr_fn="match_rms_adamw")
     for _ in range(4):
         ours.grad = torch.randn(48, 24, generator=generator)
         theirs.grad = ours.grad.clone()
@@ -91,6 +92,18 @@ def test_a_steps_size_is_adams_times_the_factor() -> None:
     step(parameters, optimiser, 0)
     size = (parameters["renderer.hidden.weight"].detach() - before).square().mean().sqrt()
     assert float(size) == pytest.approx(0.2 * 3 * 2e-2, rel=0.15)
+
+
+def test_decay_takes_its_part_of_the_rate_off_weights_alone() -> None:
+    """With gradients of 0 nothing else moves; Adam's parameters do not decay."""
+    parameters, optimiser = made(3.0, decay=0.5)
+    before = {name: parameter.detach().clone() for name, parameter in parameters.items()}
+    for parameter in parameters.values():
+        parameter.grad = torch.zeros_like(parameter)
+    optimiser.step()
+    assert torch.allclose(parameters["field.hidden.weight"], before["field.hidden.weight"] * (1 - 3 * 1e-2 * 0.5))
+    assert torch.allclose(parameters["renderer.hidden.weight"], before["renderer.hidden.weight"] * (1 - 3 * 2e-2 * 0.5))
+    assert all(torch.equal(parameters[name], before[name]) for name in ("field.table", "field.output.weight", "field.bias"))
 
 
 def test_rates_follow_progress_and_are_said_without_the_factor() -> None:
@@ -137,6 +150,7 @@ def test_a_matrix_of_another_shape_begins_with_the_momentum_it_is_given() -> Non
     ("values", "said"),
     [
         ({"muon": -1.0}, "'muon' must be at least 0"),
+        ({"muon": 1.0, "muon_weight_decay": -0.1}, "'muon_weight_decay' must be at least 0"),
         ({"beta1": 1.5}, "'beta1' and 'beta2' must be in"),
         ({"beta2": -0.1}, "'beta1' and 'beta2' must be in"),
         ({"eps": 0.0}, "'eps' must be above 0"),

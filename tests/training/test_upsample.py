@@ -17,7 +17,7 @@ from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit
 from invgraphics.training.hooks import FitState
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
-from invgraphics.training.optimisers.muon import DECAY, MOMENTUM
+from invgraphics.training.optimisers.muon import MOMENTUM, MOMENTUM_DECAY
 from invgraphics.training.upsample import Upsample, UpsampleConfig
 
 ENCODINGS = {
@@ -195,7 +195,7 @@ def test_a_hook_restarts_rates_and_drops_all_moments(scene):
         after = fit.state()["optimiser"]
         assert int(after["field.colour_net.output.weight/step"]) - before == (1 if left else -1)
         gradient = fit.model.field.geometry_net.output.weight.grad
-        anew = torch.allclose(after[f"field.geometry_net.output.weight/{MOMENTUM}"], (1 - DECAY) * gradient)
+        anew = torch.allclose(after[f"field.geometry_net.output.weight/{MOMENTUM}"], (1 - MOMENTUM_DECAY) * gradient)
         assert anew != left
         assert float(after["restarted"]) == 0.5
         assert fit._optimiser.rate_of("field.encoding.levels.0") == pytest.approx(0.05)

@@ -71,6 +71,8 @@ class OptimiserConfig:
         beta2: decay of the second moment.
         eps: added to the root of the second moment.
         muon: learning rate of weights of layers and of factor lines, over their group's; 0 leaves them to Adam.
+        muon_weight_decay: decay of these weights per step, over their learning rate. Steps of Muon do not shrink with the
+            gradients, so that without it weights grow throughout a long fit (Liu et al. 2025, arXiv 2502.16982).
     """
 
     groups: dict[str, GroupConfig] = field(default_factory=dict)
@@ -78,6 +80,7 @@ class OptimiserConfig:
     beta2: float = 0.999
     eps: float = 1e-15
     muon: float = 0.0
+    muon_weight_decay: float = 0.0
 
     def __post_init__(self) -> None:
         if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1):
@@ -86,6 +89,8 @@ class OptimiserConfig:
             raise ValueError(f"'eps' must be above 0, not {self.eps}.")
         if not self.muon >= 0:
             raise ValueError(f"'muon' must be at least 0, not {self.muon}.")
+        if not self.muon_weight_decay >= 0:
+            raise ValueError(f"'muon_weight_decay' must be at least 0, not {self.muon_weight_decay}.")
 
 
 class Optimiser:
@@ -118,7 +123,7 @@ class Optimiser:
         if masked:
             self._optimisers.append(MaskedAdam(masked, betas, config.eps))
         if hidden:
-            self._optimisers.append(Muon(hidden, config.muon))
+            self._optimisers.append(Muon(hidden, config.muon, config.muon_weight_decay))
         self._restart_progress = 0.0
         self.set_progress(0.0)
 

@@ -18,7 +18,7 @@ from invgraphics.training.optimisers.adam import GroupedOptimiser
 
 MOMENTUM = "momentum_buffer"
 """Name of the momentum in a parameter's state, torch's own."""
-DECAY = 0.95
+MOMENTUM_DECAY = 0.95
 LEAST_SIZE = 16
 """Fewest inputs and outputs of a layer that takes Muon's steps: narrower ones have too few directions to gain from it."""
 LINES = ".lines."
@@ -57,10 +57,16 @@ def orthogonalised(matrix: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
 class Muon(GroupedOptimiser):
     """Muon with Nesterov's momentum; a parameter's state is its `MOMENTUM`."""
 
-    def __init__(self, groups: Iterable[dict[str, Any]], factor: float = 1.0) -> None:
-        """Begin without momentum; ``factor`` multiplies all groups' rates."""
+    def __init__(self, groups: Iterable[dict[str, Any]], factor: float = 1.0, weight_decay: float = 0.0) -> None:
+        """Begin without momentum.
+
+        Args:
+            groups: of parameters.
+            factor: multiplies all groups' rates.
+            weight_decay: part of a weight, times the rate, that each step takes off it, decoupled from gradients.
+        """
         super().__init__(groups)
-        self._factor = factor
+        self._factor, self._weight_decay = factor, weight_decay
 
     def _update(self, parameters: list[nn.Parameter], lr: float) -> None:
         for parameter in parameters:
@@ -68,6 +74,8 @@ class Muon(GroupedOptimiser):
             assert gradient is not None
             if MOMENTUM not in state:
                 state[MOMENTUM] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
-            momentum = state[MOMENTUM].lerp_(gradient, 1 - DECAY)
-            step = orthogonalised(gradient.lerp(momentum, DECAY))
-            parameter.add_(step, alpha=-lr * self._factor * RMS * math.sqrt(max(parameter.shape)))
+            momentum = state[MOMENTUM].lerp_(gradient, 1 - MOMENTUM_DECAY)
+            step, rate = orthogonalised(gradient.lerp(momentum, MOMENTUM_DECAY)), lr * self._factor
+            if self._weight_decay > 0:
+                parameter.mul_(1 - rate * self._weight_decay)
+            parameter.add_(step, alpha=-rate * RMS * math.sqrt(max(parameter.shape)))
