@@ -133,5 +133,5 @@ def test_normals_point_where_density_falls(way: str, scene: Scene) -> None:
 
 def test_an_occupancy_grid_is_refused_which_would_know_the_mean_only(scene: Scene) -> None:
     method = load_method("prior/volumetric", "laptop", ['renderer.sampler={type="occupancy", resolution=8}'])
-    with pytest.raises(InputError, match="shows many subjects, and an occupancy grid knows"):
+    with pytest.raises(InputError, match="shows many subjects, and an occupancy grid holds"):
         build_model(method, scene, 0, torch.device("cpu"))
