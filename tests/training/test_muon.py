@@ -94,7 +94,7 @@ def test_a_steps_size_is_adams_times_the_factor() -> None:
     assert float(size) == pytest.approx(0.2 * 3 * 2e-2, rel=0.15)
 
 
-def test_decay_takes_its_part_of_the_rate_off_weights_alone() -> None:
+def test_weight_decay_is_decoupled_and_leaves_adams_parameters_alone() -> None:
     """With gradients of 0 nothing else moves; Adam's parameters do not decay."""
     parameters, optimiser = made(3.0, decay=0.5)
     before = {name: parameter.detach().clone() for name, parameter in parameters.items()}

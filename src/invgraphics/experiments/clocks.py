@@ -16,7 +16,7 @@ LEAST_SHARE = 0.85
 """A fit that ran for less of the time in which it was ready to run was disturbed: its times are not ranked."""
 
 LEAST_READY = 0.2
-"""Least time ready to run, in seconds, over which a share is computed: in less, one time slice of another program decides."""
+"""Least time ready to run, in seconds, over which the CPU share of pictures is computed: in less, one time slice decides."""
 
 
 class PictureClock:

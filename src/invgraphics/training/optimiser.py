@@ -71,8 +71,9 @@ class OptimiserConfig:
         beta2: decay of the second moment.
         eps: added to the root of the second moment.
         muon: learning rate of weights of layers and of factor lines, over their group's; 0 leaves them to Adam.
-        muon_weight_decay: decay of these weights per step, over their learning rate. Steps of Muon do not shrink with the
-            gradients, so that without it weights grow throughout a long fit (Liu et al. 2025, arXiv 2502.16982).
+        muon_weight_decay: decoupled weight decay of these matrices: a step first multiplies them by 1 - rate * decay. Steps of
+            Muon do not shrink with the gradients, so that without it weights grow all through a fit (Liu et al. 2025, arXiv
+            2502.16982).
     """
 
     groups: dict[str, GroupConfig] = field(default_factory=dict)

@@ -63,7 +63,7 @@ class Muon(GroupedOptimiser):
         Args:
             groups: of parameters.
             factor: multiplies all groups' rates.
-            weight_decay: part of a weight, times the rate, that each step takes off it, decoupled from gradients.
+            weight_decay: decoupled weight decay: a step first multiplies weights by 1 - rate * decay.
         """
         super().__init__(groups)
         self._factor, self._weight_decay = factor, weight_decay
