@@ -50,8 +50,8 @@ def perturb(field: Field, amount: float = 0.01) -> None:
 def check_field(field: Field, scene: Scene) -> None:
     """Assert the contract of a field.
 
-    Values have the right shapes and ranges and are finite, nothing comes that was not asked for, and primitives of each kind
-    that it provides are whole; gradients reach the parameters and the positions; what it knows is in its state, and comes back
+    Values have the right shapes and ranges and are finite, nothing comes that was not requested, and primitives of each kind
+    that it provides are whole; gradients reach the parameters and the positions; its state is complete, and comes back
     with it.
 
     Its parameters are perturbed before (see `perturb`) and put back afterwards.

@@ -18,7 +18,7 @@ class Infer:
     """Infer unseen instances of a class of objects with a fitted prior: only their codes are optimised.
 
     Without a photograph: the class's unseen instances, from their first observed views; their test views are scored beside the
-    class mean, the nearest training instance and, if asked, fits without a prior. Writes a page with pictures and intervals.
+    class mean, the nearest training instance and, on request, fits without a prior. Writes a page with pictures and intervals.
     The same command again keeps what is finished; other --views and --instances are added to it.
 
     With a photograph: the instance that it shows. Its camera has the class's lens and is that of --view, or else looks at the

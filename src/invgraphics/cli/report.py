@@ -151,7 +151,7 @@ def show_summary(title: str, summary: Summary) -> None:
     headings, *rows = zip(*ranked[:count], strict=True)
     show_table(title, headings, rows)
     if count < len(ranked):
-        print(f"Not shown here, for want of room: {', '.join(heading for heading, *_ in ranked[count:])}.")
+        print(f"Not shown here, as the terminal is too narrow: {', '.join(heading for heading, *_ in ranked[count:])}.")
 
 
 def _text(cell: Cell) -> str:

@@ -88,7 +88,7 @@ def _floats(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class DepthMaps:
-    """Photographs with depth, each made when it is asked for: of many, a picture is warped from a few.
+    """Photographs with depth, each made when it is requested: of many, a picture is warped from a few.
 
     Attributes:
         cameras: of all of them.
@@ -149,7 +149,7 @@ class Scene:
         colour: the space of the pixels, in which everything is fitted and composited.
         world_from_local: similarity from the local frame (all cameras, depths, points here) to the data set's world.
         exposure_spread: standard deviation, over the training photographs, of the logarithm of their exposure (display values),
-            estimated from pixels that show the same points; ``None`` where nothing tells.
+            estimated from pixels that show the same points; ``None`` where it is unknown.
         noise_ceiling: PSNR in dB between two independent half-sample renders of the truth; ``None`` for photographs.
         notes: how the pixels came about (resize filter, undistortion, files skipped), recorded in each run.
     """

@@ -32,7 +32,7 @@ def device_of(name: str | torch.device | None) -> torch.device:
         return torch.device("cpu")
     if name == "cuda":
         if not torch.cuda.is_available():
-            raise InputError("PyTorch sees no CUDA device.", "Install a CUDA build of torch, or leave out --device.")
+            raise InputError("PyTorch finds no CUDA device.", "Install a CUDA build of torch, or leave out --device.")
         return torch.device("cuda")
     raise InputError(f"The device cannot be '{name}'.", "Expected: cpu or cuda.")
 

@@ -97,7 +97,7 @@ def extract_mesh(field: Field, bounds: Bounds, resolution: int, level: float | N
     if not distances and Quantity.DENSITY not in field.provides:
         raise InputError(f"{type(field).__name__} provides {field.provides.words()}, neither density nor signed distance.")
     grid = VoxelGrid.across(bounds, resolution)
-    # Both grow towards the inside, so that one rule tells front from back.
+    # Both grow towards the inside, so that one rule separates front from back.
     if distances:
         level = 0.0 if level is None else level
         volume, level, what = -_signed_distances(field, grid, level), -level, "The signed distance"

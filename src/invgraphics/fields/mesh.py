@@ -162,7 +162,7 @@ class MeshField(Field):
 
 
 class ExtractedMesh(Field):
-    """A field that also provides the mesh of its surface, extracted when it is first asked for.
+    """A field that also provides the mesh of its surface, extracted when it is first requested.
 
     Args:
         source: provides a signed distance or a density, and radiance: the mesh's colours are its radiance at the vertices.

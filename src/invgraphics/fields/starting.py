@@ -78,7 +78,7 @@ def scene_points(scene: Scene, most: int) -> Points:
 def backdrop_points(scene: Scene, count: int) -> Points:
     """Draw ``count`` background points behind the subject, on rays of random training pixels, with their colours.
 
-    Structure from motion knows the subject and little of what is behind it. Without Gaussians there, photographs are explained
+    Structure from motion finds points of the subject and few behind it. Without Gaussians there, photographs are explained
     by floaters in front of it instead, which other views do not share. There are none in a box, which holds all there is, nor
     where photographs are transparent: emptiness is known to be behind the subject then.
 

@@ -30,7 +30,7 @@ def visual_hull(scene: Scene, resolution: int) -> Extracted:
     """Carve the visual hull (Laurentini 1994): what lies inside every training view's silhouette.
 
     A voxel's coverage is the least alpha at its centre's image in any view, bilinear between pixels; the surface is where it is
-    1/2. Views in whose picture it does not fall say nothing; where no view sees it, it is empty. Concavities that no silhouette
+    1/2. Views outside whose picture it falls do not count; where no view sees it, it is empty. Concavities that no silhouette
     shows are filled.
 
     Args:

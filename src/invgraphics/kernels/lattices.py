@@ -30,7 +30,7 @@ def lattice_encode(
         combine: concatenation, sum, VM or CP product (see `core.lattice.Combination`).
         sparse_gradients: allow gradients of features that are sparse tensors of the rows around the points, as torch's
             ``embedding`` has them: their cost does not grow with the lattice. On the CPU, of large lattices that are not
-            factors of a product, unless the graph of the gradient is asked for; all others stay dense.
+            factors of a product, unless the graph of the gradient is requested; all others stay dense.
 
     Returns:
         Features, differentiable twice in ``unit`` and in every lattice's features; the gradient along axes on which a position

@@ -17,7 +17,7 @@ FEWEST = 64
 def psnr_exposed(pair: Pair) -> float:
     """PSNR in dB of the right half, each colour channel times the factor that fits the left half best.
 
-    The halves are NeRF-W's for photographs whose exposure nothing tells. Factors are by least squares over display colours:
+    The halves are NeRF-W's for photographs of unknown exposure. Factors are by least squares over display colours:
     three numbers that hold for the other half too, where an affine map of colours would follow what is wrong with the left
     one. It depends on the pair alone: methods that fit exposures and others are scored alike. The result is clamped to [0, 1]
     and not rounded again.

@@ -21,7 +21,7 @@ F_SCORE_SHARE = 0.01
 CANDIDATES = 8
 """Nearest samples of a surface whose triangles a distance to it is computed from."""
 VIEW_PIXELS = 256
-"""Least size, along the longer side, of the depth maps that tell what a camera sees."""
+"""Least size, along the longer side, of the depth maps that decide which points a camera sees."""
 
 
 @dataclass(frozen=True, eq=False)

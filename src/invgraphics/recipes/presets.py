@@ -23,7 +23,7 @@ class Preset:
 
     Attributes:
         name: as in the recipe; empty for none.
-        choice: what chose it, in words; empty where it was asked for by name.
+        choice: what chose it, in words; empty where it was requested by name.
         chosen_on: scenes on which its values were chosen; empty where the recipe does not say.
         table: its settings.
     """

@@ -41,7 +41,7 @@ class Method:
         preset: name of the preset merged into the recipe; empty for none.
         recipe: its typed settings.
         table: the same, everything resolved, as plain values; what a run's ``recipe.toml`` holds.
-        preset_choice: what chose the preset, in words; empty where it was asked for.
+        preset_choice: what chose the preset, in words; empty where it was requested.
         chosen_on: scenes on which the preset's values were chosen.
     """
 

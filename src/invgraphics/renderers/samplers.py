@@ -21,7 +21,7 @@ PADDING = 1e-5
 
 
 MAX_SAMPLES = 1 << 16
-"""Samples of a ray; float32 barely tells more apart."""
+"""Samples of a ray; float32 barely separates more."""
 
 
 def check_samples(**counts: int) -> None:

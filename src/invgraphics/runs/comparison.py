@@ -59,7 +59,7 @@ class ComparisonRecord(Record):
         scene: its name.
         question: that the comparison answers, one sentence.
         methods: in the order of the report.
-        method_choice: why these methods, where the scene chose them; empty where they were asked for.
+        method_choice: why these methods, where the scene chose them; empty where they were requested.
         summaries: method -> what it is, one line.
         cells: method -> titles of its field and of its renderer, the row and the column of the table of methods.
         refused: methods that a pattern named and that do not go with the scene.

@@ -252,7 +252,7 @@ class RunFolder:
     def clear(self) -> None:
         """Remove the files of an unfinished or replaced run, and no others.
 
-        Its scores go first, as without them it is not finished; its provenance, which tells whose files these are, goes last.
+        Its scores go first, as without them it is not finished; its provenance, which identifies the files, goes last.
 
         Raises:
             InputError: there are files in their places, and no provenance of a run that wrote them.

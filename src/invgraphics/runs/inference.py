@@ -35,7 +35,7 @@ class PriorFit:
 
     Attributes:
         parameters: of field and renderer, the training instances' codes among them.
-        budget: as asked for, ``600s`` or ``5000steps``.
+        budget: as requested, ``600s`` or ``5000steps``.
         steps: of optimisation.
         seconds: that these took.
     """

@@ -97,7 +97,7 @@ class Provenance(Record):
         cell_sha256: identity of the run: equal for equal bits, on one machine.
         method: ``renderer/recipe``.
         preset: of the recipe; empty for none.
-        preset_choice: what chose the preset, in words; empty where it was asked for.
+        preset_choice: what chose the preset, in words; empty where it was requested.
         preset_chosen_on: scenes on which the preset's values were chosen.
         recipe_sha256: of the resolved recipe.
         scene: built-in scene, or path of the data set, as given.

@@ -23,7 +23,7 @@ class Run:
         method: ``renderer/recipe``; a report may extend it to tell variants apart.
         seed: of the fit.
         scores: under one protocol.
-        provenance: what it was asked for, and hashes.
+        provenance: the request, and hashes.
         environment: machine and versions.
         history: how the fit went, oldest first.
     """

@@ -78,7 +78,7 @@ class Scores(Record):
     Attributes:
         method: ``renderer/recipe``; the folder's name for pictures of another tool.
         preset: of the recipe; empty for none.
-        preset_choice: what chose the preset, in words; empty where it was asked for.
+        preset_choice: what chose the preset, in words; empty where it was requested.
         scene: its name.
         seed: of the fit; ``None`` for pictures of another tool.
         protocol: its name.

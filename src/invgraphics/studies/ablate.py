@@ -119,7 +119,7 @@ def _state(planned: Planned, keep: bool, chosen: bool) -> CellState:
 
     Args:
         planned: the cell and its run.
-        keep: whether a finished run counts although the code has changed since: its folder's name tells recipe, scene and
+        keep: whether a finished run counts although the code has changed since: its folder is named by recipe, scene and
             request.
         chosen: whether the cell is part of this command.
     """

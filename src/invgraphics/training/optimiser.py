@@ -17,7 +17,7 @@ from invgraphics.training.optimisers.adam import MOMENTS, ROW_RATES, DenseAdam, 
 from invgraphics.training.optimisers.muon import MOMENTUM, Muon, takes_muon
 
 _MOMENTS = {*MOMENTS, MOMENTUM}
-"""Names of what any of the optimisers remembers of a parameter's gradients, entry by entry."""
+"""Names of the optimisers' running moments of a parameter's gradients, entry by entry."""
 RESTARTED = "restarted"
 """Name in an optimiser's state of the progress at which rates were restarted last."""
 LATEST_RESTART = 0.999

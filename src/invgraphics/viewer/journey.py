@@ -1,4 +1,4 @@
-"""Journey of a browser's camera to a photograph: tells late reports from a camera that was moved away."""
+"""Journey of a browser's camera to a photograph: separates late reports from a camera that was moved away."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Outcome:
     """Result of one fit: finished, failed or interrupted.
 
     Attributes:
-        request: what it was asked to do.
+        request: of that process.
         status: exit status of its process: 0 done, 130 interrupted, anything else failed.
         error: what went wrong, for a person; empty where nothing did.
         seconds: from the start of its process to the end, evaluation included.

@@ -35,7 +35,7 @@ class Place:
 
     Attributes:
         group: what the lattice is: ``levels``, ``planes`` or ``lines``. Its parameter is called ``group.key``.
-        key: tells it from others of the group.
+        key: its name within the group.
         axes: the axes that it spans.
     """
 

@@ -39,7 +39,7 @@ class Comparison:
         cells: method -> titles of its field and of its renderer.
         refused: methods that were left out, because they do not go with the scene.
         shown: methods that get pictures and curves; empty for all.
-        method_choice: why these methods, where the scene chose them; empty where they were asked for.
+        method_choice: why these methods, where the scene chose them; empty where they were requested.
     """
 
     scene: str

@@ -33,7 +33,7 @@ DEPTH_STYLES = {
 WIDE = 12.0
 """Ratio of far to near beyond which distances are drawn logarithmically."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of sRGB's primaries; tells dark swatches from light ones."""
+"""Of sRGB's primaries; separates dark swatches from light ones."""
 CELLS = 900
 """Cells of a colour strip."""
 

@@ -4,7 +4,7 @@ A pixel's value is the mean radiance over its area (the film's box filter), so a
 a rendering at the smaller size converges to, with all their samples. Depth and normals belong to pixel centres and cannot be
 averaged: they are traced at the new size, one ray per pixel.
 
-``python -m invgraphics.scenes.mitsuba.average FOLDER`` does what ``FOLDER/job.json`` asks for, as the rendering process does.
+``python -m invgraphics.scenes.mitsuba.average FOLDER`` does the job of ``FOLDER/job.json``, as the rendering process does.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The rendering process: ``python -m invgraphics.scenes.mitsuba.render FOLDER`` does what ``FOLDER/job.json`` asks for.
+"""The rendering process: ``python -m invgraphics.scenes.mitsuba.render FOLDER`` renders the job of ``FOLDER/job.json``.
 
 It runs apart from the caller because a bad LLVM aborts the process that uses it. It reports on its standard output, a line per
 view: ``progress DONE TOTAL WHAT``. Views that an interrupted process has left are kept.
@@ -49,7 +49,7 @@ def main(folder: Path) -> None:
     for split in SPLITS:
         for index, camera in enumerate(views[split]):
             if os.getppid() != parent:
-                sys.exit("nobody waits for this rendering any more")  # what is done stays, and is gone on with
+                sys.exit("the process that started this rendering has ended")  # what is done stays, and is gone on with
             write_progress(done, job.total, f"{split} {index:04d}")
             if not folders.view_paths(folder, split, index)[1].exists():
                 _render_view(job, scene, model, folder, (split, index, camera))

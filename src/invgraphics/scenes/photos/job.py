@@ -50,7 +50,7 @@ class PhotoJob:
     """One reconstruction.
 
     Attributes:
-        folder: of the photographs; or a data set that `invgraphics.scenes.open` knows, whose pictures (not poses) are taken.
+        folder: of the photographs; or a data set that `invgraphics.scenes.open` reads, whose pictures (not poses) are taken.
         matching: which pairs are compared: all, each with those near it in name order, or ``auto`` by their number, and all
             where these place few.
         mapper: COLMAP's incremental mapper, or its global one (GLOMAP); ``auto``: the first, and the other where the result is

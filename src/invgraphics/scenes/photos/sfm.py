@@ -20,7 +20,7 @@ NEIGHBOURS = 10
 
 _CHUNK = 8  # photographs whose features are extracted between two lines of progress
 _PAIRS = 100  # pairs matched between two lines of progress
-_GUESS = 1.2  # focal length over the longest side where nothing tells, as in COLMAP
+_GUESS = 1.2  # focal length over the longest side where no metadata gives it, as in COLMAP
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The work process: ``python -m invgraphics.scenes.photos.work FOLDER`` does what ``FOLDER/job.json`` asks for.
+"""The work process: ``python -m invgraphics.scenes.photos.work FOLDER`` does the job of ``FOLDER/job.json``.
 
 It runs apart from the caller because pycolmap may end a process that gets a signal, or that runs out of memory, without a word.
 Stages that an interrupted process has finished are kept.

@@ -56,7 +56,7 @@ def shares_origin(origins, r, first):
 def optical_depths(table, strength, reading, gaussian, begin, end, o, d, t, sigma, depth):
     """Distance, width and optical depth of a ray's Gaussians; returns the interval that they cover.
 
-    ``reading`` tells whether strengths are per length, and whether a Gaussian absorbs its own light.
+    ``reading``: whether strengths are per length, and whether a Gaussian absorbs its own light.
     """
     low, high = np.float32(np.inf), np.float32(-np.inf)
     for p in range(begin, end):

@@ -32,7 +32,7 @@ _BITS, _BUCKETS, PASSES = np.uint32(8), 256, 2
 _LAST_KEY = np.float32(65535.0)
 """Edges are sorted in steps of this part of a ray's interval, which is far less than a node's distance from the next."""
 _DEEPEST = np.float32(18.0)
-"""Optical depth of the staircase behind which Gaussians are not looked at: float32 knows no alpha between it and 1."""
+"""Optical depth of the staircase behind which Gaussians are not looked at: float32 has no alpha between it and 1."""
 
 
 @inlined

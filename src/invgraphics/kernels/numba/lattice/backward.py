@@ -17,7 +17,7 @@ from invgraphics.kernels.numba.simd.lanes import load, store
 from invgraphics.kernels.numba.simd.partial import floats_at, unowned
 
 SAMPLE = 61
-"""Every so many-th point tells where on a lattice the work lies: a prime, so that it keeps step with no number of samples."""
+"""Stride of the points that show where on a lattice the work lies: a prime, so that it keeps step with no number of samples."""
 TARGET = np.dtype([(name, np.int64) for name in ("gradient", "copy")])
 """Per lattice: address of its features' gradient, 0 where none is wanted; first float in a job's copy, -1 for no copy."""
 PASS = np.dtype([(name, np.int64) for name in ("first", "end", "pivot", "copied")])
