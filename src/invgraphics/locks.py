@@ -93,7 +93,8 @@ def locked(what: Path, file: Path | None = None, waiting: Callable[[Holder], Non
     finally:
         del _held[key]
         with contextlib.suppress(OSError):
-            key.unlink()  # before it is freed: whoever opened this file finds out that it is no longer the one
+            if _is_current(descriptor, key):  # the folder may have been removed, and made again by another process
+                key.unlink()  # before it is freed: whoever opened this file finds out that it is no longer the one
         os.close(descriptor)
 
 

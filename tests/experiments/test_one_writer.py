@@ -26,6 +26,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import save_truth
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
+from invgraphics.experiments.start import remove_empty
 from invgraphics.report.data.assets import LOCK
 from invgraphics.runs.folder import RunFolder
 from invgraphics.scenes.mitsuba import cache
@@ -72,6 +73,31 @@ def test_of_two_different_fits_one_is_refused(toy_folder: Path, tmp_path: Path, 
     assert json.loads((out / "provenance.json").read_text())["seed"] == first
     assert json.loads((out / "scores.json").read_text())["seed"] == first
     assert not (out / locks.INSIDE).exists()
+
+
+def test_a_refused_fit_leaves_the_folder_that_another_has_just_locked(tmp_path: Path) -> None:
+    """The refused one of two that began at the same moment removed the other's folder, which held nothing but a lock yet."""
+    out = tmp_path / "run"
+    out.mkdir()
+    with ExitStack() as stack:
+        other = Holder(out, tmp_path, out / locks.INSIDE)
+        stack.callback(other.end)
+        remove_empty(out)
+        assert (out / locks.INSIDE).is_file()
+    remove_empty(out)
+    assert not out.exists()
+
+
+def test_the_lock_of_a_folder_that_was_made_again_stays(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    with ExitStack() as stack:
+        with locks.locked(out, out / locks.INSIDE):
+            shutil.rmtree(out)
+            out.mkdir()
+            other = Holder(out, tmp_path, out / locks.INSIDE)
+            stack.callback(other.end)
+        assert (out / locks.INSIDE).is_file()
 
 
 def test_a_holder_that_has_not_signed_yet_is_waited_for(tmp_path: Path) -> None:
@@ -178,10 +204,10 @@ def test_a_copy_of_a_scene_is_refused_too(tmp_path: Path) -> None:
 
 
 class Holder:
-    """Another process that holds the lock beside a path."""
+    """Another process that holds the lock beside a path, or the one in ``file``."""
 
-    def __init__(self, what: Path, folder: Path) -> None:
-        environment = {"HELD": str(what), "READY": str(folder / "ready")}
+    def __init__(self, what: Path, folder: Path, file: Path | None = None) -> None:
+        environment = {"HELD": str(what), "READY": str(folder / "ready")} | ({"LOCK": str(file)} if file else {})
         self.process = Running(["--version"], folder / "log", f"{__name__}:hold", environment)
         while not (folder / "ready").exists() and self.process.alive():
             time.sleep(0.01)
@@ -193,7 +219,8 @@ class Holder:
 
 def hold() -> None:
     """Hold a lock until killed."""
-    with locks.locked(Path(os.environ["HELD"])):
+    file = os.environ.get("LOCK")
+    with locks.locked(Path(os.environ["HELD"]), Path(file) if file else None):
         Path(os.environ["READY"]).touch()
         time.sleep(600)
 

@@ -57,10 +57,10 @@ def check_source(method: Method, scene_spec: str) -> None:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove a folder where it holds nothing but its lock."""
-    with suppress(OSError):
+    """Remove a folder where it holds nothing but its lock, unless another process holds that: it is about to write there."""
+    with suppress(OSError, InputError), locks.locked(folder, folder / locks.INSIDE):
         if all(path.name == locks.INSIDE for path in folder.iterdir()):
-            (folder / locks.INSIDE).unlink(missing_ok=True)
+            (folder / locks.INSIDE).unlink()
             folder.rmdir()
 
 
