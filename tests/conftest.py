@@ -1,6 +1,7 @@
 """Fixtures shared by all tests."""
 
-import invgraphics  # noqa: F401, I001  # before torch, which then reads how long its waiting threads may spin
+import shared_cores  # noqa: F401, I001  # before torch, as the next one
+import invgraphics  # noqa: F401  # before torch, which then reads how long its waiting threads may spin
 
 import os
 from collections.abc import Callable, Iterator
@@ -34,7 +35,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)  # `torch.manual_seed` looks for accelerators as well, for 3 ms
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -48,6 +49,15 @@ def _kernels() -> Iterator[None]:
     """Kernels that a test forces are its own."""
     yield
     kernels.use(None)
+
+
+@pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plots are laid out but not painted, which takes half of the time of a page, for tests of everything but plots."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "draw_without_rendering", lambda figure: None)
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **settings: file.write("<svg/>"))
 
 
 @pytest.fixture

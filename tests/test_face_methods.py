@@ -14,6 +14,8 @@ from invgraphics.studies.factors import override
 from invgraphics.tables import parse_toml
 from invgraphics.testing import toy_scene
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SPLATS = ig.load_method("splatting/gaussians", set={"field.count": 60, "field.max_init": 60, "field.sh_degree": 0})
 ONE, TWO = ({**SPLATS.table, "batches": {"views": views}} for views in (1, 2))
 

@@ -35,7 +35,7 @@ def write_blender_scene(folder: Path) -> None:
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
 
 
-def test_compare_then_evaluate_and_report(tmp_path, capsys) -> None:
+def test_compare_then_evaluate_and_report(tmp_path, capsys, request) -> None:
     data, out = tmp_path / "disc", tmp_path / "out"
     data.mkdir()
     write_blender_scene(data)
@@ -51,6 +51,8 @@ def test_compare_then_evaluate_and_report(tmp_path, capsys) -> None:
     assert (table["preset"], table["preset_choice"]) == ("laptop", "as for every budget in steps")
     assert "preset: laptop, as for every budget in steps" in (out / "index.md").read_text()
 
+    for quicker in ("in_process", "unpainted"):  # one fit in a process of its own is enough, and so is one page with plots
+        request.getfixturevalue(quicker)
     cell = out / "runs" / "splatting-gaussians" / "seed-0"
     assert runs_in(out) == runs_in(cell) == [cell]
     assert main.run(["evaluate", str(cell), "--protocol", "float"]) == main.DONE

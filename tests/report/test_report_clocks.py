@@ -105,6 +105,7 @@ def _best(summary, key: str) -> list[str]:
     return [row.label for row in summary.rows if summary.cell(row, key).best]
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_page_says_it_in_red(tmp_path: Path) -> None:
     root = write_comparison(tmp_path)
     scores = sorted(root.glob("runs/*/*/scores.json"))[0]

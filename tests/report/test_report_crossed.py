@@ -71,6 +71,7 @@ def test_scores_and_differences_are_means_over_seeds_and_views(crossed_folder: P
     assert [step.depths for step in crossed.steps] == [(f"{depth:.2g}",)] and crossed.shows_depth
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_the_page_shows_it(crossed_folder: Path) -> None:
     page = build_report(crossed_folder).read_text()
     assert '<section id="crossed">' in page and 'href="#crossed"' in page
@@ -115,6 +116,7 @@ def test_a_study_shows_approximations_and_analyses(small_study: Path) -> None:
     assert "Approximations by themselves" in text and "all that is approximate" in text
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_broken_analysis_is_explained(small_study: Path) -> None:
     table = json.loads((small_study / "study.json").read_text()) | {"analyses": ["one"]}
     (small_study / "study.json").write_text(json.dumps(table))

@@ -19,6 +19,8 @@ from invgraphics.errors import InputError
 from invgraphics.report.data.redact import HIDDEN, Redactor, redactor_for
 from invgraphics.report.study import build_study_report
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 USER, HOST, LOGIN, NODE = "ada_lovelace", "analyticalengine", "countess", "babbage-07"
 HOME = f"/home/{USER}/My Experiments/fox"
 

@@ -15,6 +15,8 @@ from invgraphics.report.build import build_from_runs, build_report
 from invgraphics.report.data.comparison import read_comparison
 from invgraphics.runs.run import read_run
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 RUN = "runs/volumetric-hash/seed-0"
 
 

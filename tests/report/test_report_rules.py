@@ -18,6 +18,8 @@ from invgraphics.report.statistics.rules import RULES, JudgedCell, judge, unused
 from invgraphics.report.study import build_study_report
 from invgraphics.studies.study import KnownDeviation
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 SPLATS, HASH = "splatting/gaussians", "volumetric/hash"
 
 

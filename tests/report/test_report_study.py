@@ -45,6 +45,8 @@ from invgraphics.report.wording import quality_quantity
 from invgraphics.runs.scores import Score
 from invgraphics.scenes.truth import POINTS
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 VIEWS, LEVELS = STUDY_FACTORS
 PSNR = quality_quantity("psnr", Score(mean=0.0, unit="dB", higher_is_better=True))
 

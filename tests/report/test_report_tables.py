@@ -21,6 +21,8 @@ from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.pages.facts import protocol_facts, start_fact
 from invgraphics.runs.run import Run
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 HIGHER = {"psnr", "ssim", "alpha_iou", "render_fps"}
 LOWER = {"flip", "depth_abs_rel", "normal_deg", "peak_memory_bytes", "model_bytes"}
 

@@ -17,6 +17,8 @@ from invgraphics.studies.forecast import Forecast
 from invgraphics.studies.reading import locate, read_study, with_request
 from invgraphics.training.budget import Budget
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
 LIST = 'question = "Does it hold?"\ndesign = "list"\nreport = "verdicts"\nscenes = ["a", "b"]\nseeds = [0, 1]\nsize = 64\n'
 LIST += f"methods = {json.dumps(METHODS[1:])}\n"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from invgraphics.files import write_text
 from invgraphics.report.data.assets import Folder
@@ -16,20 +17,28 @@ from invgraphics.report.pages.tables import escape_markdown, markdown_effects, m
 from invgraphics.report.statistics.cross_render import CrossTable
 from invgraphics.report.wording import listing
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
-def render(template: str, context: Mapping[str, Any], folder: Folder) -> None:
-    """Write ``index.html``: one file with its style and script inside, its pictures beside it."""
+
+@cache
+def _templates() -> Environment:
+    """The pages' templates, each compiled once."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
+    return Environment(
         loader=PackageLoader("invgraphics.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+
+
+def render(template: str, context: Mapping[str, Any], folder: Folder) -> None:
+    """Write ``index.html``: one file with its style and script inside, its pictures beside it."""
     shared = {"url": folder.url, "palette": SERIES, "has_flip": has_flip(), "public": folder.redactor is not None}
-    html = environment.get_template(template).render({**shared, **context})
+    html = _templates().get_template(template).render({**shared, **context})
     write_text(folder.root / "index.html", html)
 
 
