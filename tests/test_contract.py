@@ -1,4 +1,4 @@
-"""The doors are wide enough: what strangers would plug in, in at most 60 lines each and with no edit to the package."""
+"""The contract suffices: what third-party packages would plug in, in at most 60 lines each and with no edit to the package."""
 
 import inspect
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""docs/extending.md as a stranger's package: installed by entry points, conforming, fitted, compared and reported."""
+"""docs/extending.md as a third-party package: installed by entry points, conforming, fitted, compared and reported."""
 
 import json
 import os

@@ -1,7 +1,7 @@
 """Registries: literal dictionaries of ``"module:object"``, extended by entry points.
 
 Nothing heavy is imported to *list* what there is; an object is imported when it is used.
-A stranger's package joins by declaring an entry point in the group ``invgraphics.<registry>``,
+A third-party package joins by declaring an entry point in the group ``invgraphics.<registry>``,
 for instance ``[project.entry-points."invgraphics.fields"] mine = "my_package:MyFieldConfig"``.
 A built-in part keeps its name: an entry point of the same name is left out, with a warning.
 """
@@ -128,7 +128,7 @@ def load(registry: str, name: str) -> Any:
     module, _, attribute = target.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
-    except (Exception, SystemExit) as error:  # a stranger's module may raise anything, or leave
+    except (Exception, SystemExit) as error:  # a third-party module may raise anything, or leave
         source = origin(registry, name)
         if source == "built in" and not isinstance(error, ImportError | AttributeError):
             raise
@@ -137,7 +137,7 @@ def load(registry: str, name: str) -> Any:
 
 
 def load_all(registry: str, known: Iterable[str] | None = None) -> Iterator[tuple[str, Any]]:
-    """Import objects of a registry one by one, as (name, object); a stranger's that fails is left out with a warning.
+    """Import objects of a registry one by one, as (name, object); a third-party one that fails is left out with a warning.
 
     Args:
         registry: that holds them.
@@ -156,7 +156,7 @@ def load_all(registry: str, known: Iterable[str] | None = None) -> Iterator[tupl
 
 @cache
 def leave_out(sentence: str) -> None:
-    """Print once on stderr that a stranger's broken part is left out, so that what does not need it goes on."""
+    """Print once on stderr that a broken third-party part is left out, so that what does not need it goes on."""
     print(f"Left out: {sentence}", file=sys.stderr)
 
 

@@ -1,4 +1,4 @@
-"""Strangers' parts that cannot be imported: what does not use them works, and what does names package and error."""
+"""Third-party parts that cannot be imported: what does not use them works, and what does names package and error."""
 
 from pathlib import Path
 
@@ -52,12 +52,12 @@ RAISED = {
 @pytest.fixture(params=RAISED)
 def said(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A package whose modules fail, installed for one test; returns what its error says."""
-    info = tmp_path / "site" / "stranger_broken-1.0.dist-info"
+    info = tmp_path / "site" / "third_party_broken-1.0.dist-info"
     info.mkdir(parents=True)
     code, words = RAISED[request.param]
     (info.parent / "broken_parts.py").write_text(code)
     (info.parent / "fine_parts.py").write_text(GOOD)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger-broken\nVersion: 1.0\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: third-party-broken\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(info.parent)
     plugins.leave_out.cache_clear()
@@ -67,9 +67,9 @@ def said(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_name_that_a_built_in_has_is_left_out_with_a_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    info = tmp_path / "stranger_taken-1.0.dist-info"
+    info = tmp_path / "third_party_taken-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger-taken\nVersion: 1.0\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: third-party-taken\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(TAKEN_NAMES)
     monkeypatch.syspath_prepend(tmp_path)
     plugins.leave_out.cache_clear()
@@ -78,8 +78,8 @@ def test_a_name_that_a_built_in_has_is_left_out_with_a_line(
     assert {plugins.origin("fields", "gaussians"), plugins.origin("recipes", "volumetric/nerf")} == {"built in"}
     assert not plugins.used_plugins({"field": {"type": "gaussians"}}, "volumetric/nerf")
     assert capsys.readouterr().err.splitlines() == [
-        "Left out: 'gaussians' of the fields (fine_parts:Gaussians, stranger-taken): a built-in has this name.",
-        "Left out: 'volumetric/nerf' of the recipes (fine_parts:NERF, stranger-taken): a built-in has this name.",
+        "Left out: 'gaussians' of the fields (fine_parts:Gaussians, third-party-taken): a built-in has this name.",
+        "Left out: 'volumetric/nerf' of the recipes (fine_parts:NERF, third-party-taken): a built-in has this name.",
     ]
 
 
@@ -90,8 +90,8 @@ def test_lists_leave_broken_parts_out_with_a_line_each(said: str, capsys: pytest
     assert "volumetric/broken" not in listed.out and "volumetric/no-toml" not in listed.out
     warnings = listed.err.splitlines()
     # A line each in spite of two lists: three recipes, and in the matrix the field of one and the lack of another's.
-    assert len(warnings) == len(set(warnings)) == 5 and all("stranger-broken" in line for line in warnings)
-    named = "'volumetric/broken' of the recipes (broken_parts:RECIPE, stranger-broken) cannot be imported"
+    assert len(warnings) == len(set(warnings)) == 5 and all("third-party-broken" in line for line in warnings)
+    named = "'volumetric/broken' of the recipes (broken_parts:RECIPE, third-party-broken) cannot be imported"
     assert f"Left out: {named}: {said}" in warnings
 
 
@@ -101,10 +101,10 @@ def test_other_methods_are_found_and_the_broken_one_is_explained(said: str, caps
     assert main.run(["compare", "bricks", "--methods", "volumetric/nrf"]) == main.BAD_INPUT
     assert "Did you mean 'volumetric/nerf'?" in capsys.readouterr().err
     for name in ("volumetric/broken", "volumetric/listed"):  # its own module, and that of its field
-        with pytest.raises(InputError, match="stranger-broken") as caught:
+        with pytest.raises(InputError, match="third-party-broken") as caught:
             load_method(name, preset="")
         assert caught.value.sentence.endswith(said)
-    with pytest.raises(InputError, match=r"volumetric/no-toml of stranger-broken is not valid TOML"):
+    with pytest.raises(InputError, match=r"volumetric/no-toml of third-party-broken is not valid TOML"):
         source("volumetric/no-toml")
 
 
@@ -117,4 +117,4 @@ def test_other_fields_and_formats_are_found(said: str, tmp_path: Path, capsys: p
     (tmp_path / "nothing").mkdir()
     with pytest.raises(InputError, match="is an empty folder"):
         find_loader(tmp_path / "nothing")
-    assert capsys.readouterr().err.count(f"stranger-broken) cannot be imported: {said}") == 2
+    assert capsys.readouterr().err.count(f"third-party-broken) cannot be imported: {said}") == 2

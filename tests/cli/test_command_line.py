@@ -131,7 +131,7 @@ def test_list_names_everything_that_is_registered() -> None:
     assert "bricks" in text
 
 
-def test_a_strangers_package_shows_in_the_list(tmp_path) -> None:
+def test_a_third_party_package_shows_in_the_list(tmp_path) -> None:
     """A distribution made by hand, found through its entry points alone: its module does not even exist."""
     info = tmp_path / "their_package-1.0.dist-info"
     info.mkdir()

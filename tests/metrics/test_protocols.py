@@ -189,7 +189,7 @@ class Point:
         self.name, self.value = name, f"{__name__}:{target}"
 
 
-def test_a_strangers_metric_is_scored_and_cannot_spoil_the_others(monkeypatch) -> None:
+def test_a_third_party_metric_is_scored_and_cannot_spoil_the_others(monkeypatch) -> None:
     points = [Point("bias", "BIAS"), Point("faulty", "FAULTY"), Point("gone", "ABSENT"), Point("odd", "HEIGHT")]
     points.append(Point("nothing", "NOTHING"))
     monkeypatch.setattr(plugins, "_entry_points", lambda path: points)

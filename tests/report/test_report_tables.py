@@ -19,6 +19,7 @@ from invgraphics.metrics.conventions import PROTOCOLS, Protocol
 from invgraphics.report.build import build_report
 from invgraphics.report.data.comparison import read_comparison
 from invgraphics.report.pages.facts import protocol_facts, start_fact
+from invgraphics.report.statistics.summary import summarise
 from invgraphics.runs.run import Run
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -340,3 +341,16 @@ def test_hostile_names_are_escaped_everywhere(comparison_folder: Path, edit: Cal
     latex = (comparison_folder / "table.tex").read_text()
     assert r"\textless{}script\textgreater{}" in latex
     assert r"\$x\_1\$" in latex
+
+
+def test_a_text_table_says_what_its_marks_mean(pristine_comparison: Path) -> None:
+    """It promised a mark of the best where one seed can mark nothing."""
+    comparison = read_comparison(pristine_comparison)
+    marked = any(cell.best for row in summarise(comparison).rows for cell in row.cells)
+    assert marked and summarise(comparison).legend == "(* leads all others by more than chance)"
+    level = replace(comparison, runs=tuple(replace(run, scores=comparison.runs[run.seed].scores) for run in comparison.runs))
+    assert summarise(level).legend == "(none leads all others by more than chance)"
+    single = replace(comparison, runs=tuple(run for run in comparison.runs if run.seed == 0))
+    assert summarise(single).legend == "(one seed: no difference is told from chance)"
+    alone = replace(comparison, methods=comparison.methods[:1], runs=comparison.runs_of(comparison.methods[0]))
+    assert summarise(alone).legend == ""

@@ -111,19 +111,19 @@ def test_the_same_request_is_answered_at_once(imported, box_photos: Path, monkey
 
 @pytest.mark.usefixtures("in_process")
 def test_another_mapper_finds_features_and_matches(imported, box_photos: Path, tmp_path: Path) -> None:
-    """The data base that lies there is used: what a stranger has written into it is still there afterwards."""
+    """The data base that lies there is used: what another program has written into it is still there afterwards."""
     out = tmp_path / "scene"
     shutil.copytree(imported[0], out)
     database = out / ".import" / DATABASE
     with closing(sqlite3.connect(database)) as content:
-        content.execute("create table stranger (x)")
+        content.execute("create table other (x)")
     job = PhotoJob(str(box_photos), lens="pinhole", mapper="global")
     quality = reconstruct(job, out)
     assert quality["registered"] == 10
     assert quality["choice"].startswith("global mapper")
     assert float(truth_errors(quality).rotation_degrees.max()) < 2
     with closing(sqlite3.connect(database)) as content:
-        assert content.execute("select count(*) from stranger").fetchone() == (0,)
+        assert content.execute("select count(*) from other").fetchone() == (0,)
     assert job.matches_key() == PhotoJob(str(box_photos)).matches_key()
     for other in ({"max_size": 200}, {"lens": "fisheye"}, {"seed": 1}, {"matching": "sequential"}):
         assert PhotoJob(str(box_photos), **other).matches_key() != job.matches_key()

@@ -77,7 +77,7 @@ def test_poses_are_compared_without_the_pictures_in_memory(data_set, monkeypatch
     assert (truth["cameras"], truth["rotation_degrees"]["max"]) == (9, pytest.approx(10, abs=1e-3))
 
 
-def test_strangers_are_refused(data_set) -> None:
+def test_other_photographs_are_refused(data_set) -> None:
     folder, poses = data_set
     with pytest.raises(InputError, match="has poses of 0 of the 9"):
         compare(folder / "images", report(poses, [f"other{index}.png" for index in range(9)]), folder)

@@ -136,7 +136,7 @@ def test_pictures_of_another_tool_score_like_the_run_they_came_from(run: Path, t
     for metric in ("psnr", "ssim", "flip"):
         assert got.quality[metric].per_view == pytest.approx(expected[metric]["per_view"], abs=1e-9)
     result = rescore([open_pictures(theirs, background=WHITE)], protocols_named("multinerf,instant-ngp,3dgs-metrics"))[0]
-    assert write_scores(result, None) == []  # nothing is written into a stranger's folder
+    assert write_scores(result, None) == []  # nothing is written into a folder of somebody else's
     assert "psnr" in result.scores["multinerf"].quality
     assert "in front of black; here it is in front of white already" in result.scores["3dgs-metrics"].skipped["psnr"]
     assert "unrounded predictions" in result.scores["instant-ngp"].skipped["ssim"]

@@ -86,7 +86,7 @@ class ComparisonResult:
         )
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Summary table of the report: headings, and a row of texts for each method and baseline; * marks the best."""
+        """Summary table of the report: headings, and a row of texts for each method and baseline; * marks significant leads."""
         summary = summarise(self.record)
         rows = [[row.label, *(f"{cell.text}{' *' if cell.best else ''}" for cell in row.cells)] for row in summary.rows]
         return ["", *(column.heading for column in summary.columns)], rows
@@ -96,7 +96,7 @@ class ComparisonResult:
         return f"{self.record.question} {len(self.record.runs)} runs{failed}: {self.page}"
 
     def _repr_html_(self) -> str:
-        return table_html(f"{self.record.question} (* best)", *self.table())
+        return table_html(f"{self.record.question} {summarise(self.record).legend}".strip(), *self.table())
 
 
 def compare(

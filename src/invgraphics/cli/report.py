@@ -126,7 +126,7 @@ def write_report(folder: Path, out: Path | None = None, public: bool = False) ->
     page = build_report(folder, out, public)
     comparison = read_comparison(folder)
     summary = summarise(comparison)
-    show_summary(f"{comparison.question} (* best)", summary)
+    show_summary(f"{comparison.question} {summary.legend}".strip(), summary)
     for sentence in dict.fromkeys(run.scores.below_baseline for run in comparison.runs if run.scores.below_baseline):
         print(sentence)
     for failure in comparison.failures:

@@ -123,9 +123,8 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     jobs, refused = _jobs(request)
     full = opened or open_with_progress(request.scene, jobs[0].options)
     if start := _start_for_all(request, jobs, full):
-        print(
-            f"Methods have points that are found in the training photographs ({start}); `data.init` overrides.", file=sys.stderr
-        )
+        points = f"Points to start from are found in the training photographs ({start})"
+        print(f"{points}; --set data.init=scene|random overrides.", file=sys.stderr)
         request = replace(request, overrides=(*request.overrides, start))
         jobs = [Job.of(replace(job.request, overrides=request.overrides), job.method) for job in jobs]
     methods = {job.request.method: job.method for job in jobs}

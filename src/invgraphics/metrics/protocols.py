@@ -185,7 +185,7 @@ def _registered(name: str, pair: Pair) -> float:
     except Exception as error:
         if plugins.origin("metrics", name) == "built in":
             raise
-        # A stranger's mistake must not cost the scores of a finished fit.
+        # A third-party metric's mistake must not cost the scores of a finished fit.
         raise Skip(f"{plugins.origin('metrics', name)}: {type(error).__name__}: {error}") from error
     if not math.isfinite(value):
         raise Skip(f"the value is not finite ({value})")

@@ -79,7 +79,7 @@ class Method:
 def methods() -> dict[str, str]:
     """List all known methods, name -> summary, built-in ones first; imports no implementation.
 
-    A stranger's recipe that cannot be read is left out, with a warning.
+    A third-party recipe that cannot be read is left out, with a warning.
     """
     root = find("renderers")
     found = {}
@@ -228,7 +228,7 @@ def source(name: str) -> dict[str, Any]:
 
 
 def is_built_in(name: str) -> bool:
-    """Whether a method of `methods` is one of ours; a stranger's recipe cannot take its name."""
+    """Whether a method of `methods` is one of ours; a third-party recipe cannot take its name."""
     return (find("renderers") / f"{name}.toml").is_file()
 
 

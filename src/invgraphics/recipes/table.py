@@ -12,7 +12,7 @@ from invgraphics.recipes.recipe import is_built_in, methods, source
 def matrix() -> tuple[list[str], list[str], dict[tuple[str, str], list[str]]]:
     """Build the matrix of methods: fields as rows, renderers as columns, methods in each cell in the order of `methods`.
 
-    A stranger's recipe that names no usable field or renderer is left out, with a warning.
+    A third-party recipe that names no usable field or renderer is left out, with a warning.
     """
     cells: dict[tuple[str, str], list[str]] = {}
     for name in methods():

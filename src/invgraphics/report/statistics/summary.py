@@ -105,6 +105,17 @@ class Summary:
         return tuple(row for row in self.rows if row.kind == "method")
 
     @property
+    def legend(self) -> str:
+        """What * marks in a text table, or why it marks nothing, in parentheses; empty where nothing is compared."""
+        if len(self.methods) < 2:
+            return ""
+        if any(cell.best for row in self.methods for cell in row.cells):
+            return "(* leads all others by more than chance)"
+        if all(row.seeds < 2 for row in self.methods):
+            return "(one seed: no difference is told from chance)"
+        return "(none leads all others by more than chance)"
+
+    @property
     def disturbances(self) -> tuple[str, ...]:
         """A sentence for each method whose times are not ranked."""
         return tuple(f"The times of {row.label} are not ranked: {row.disturbed}." for row in self.methods if row.disturbed)

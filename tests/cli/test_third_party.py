@@ -1,4 +1,4 @@
-"""A field and a renderer from a stranger's package, found by entry points: they take part without an edit to ours."""
+"""A field and a renderer from a third-party package, found by entry points: they take part without an edit to ours."""
 
 import json
 import os
@@ -64,7 +64,7 @@ class Exposed(RayRenderer):
         return Exposed(self.sampler.untrained())
 
 RECIPE = """
-summary = "Even fog from a stranger"
+summary = "Even fog of a third party"
 paper = "none"
 [field]
 type = "fog"
@@ -89,18 +89,19 @@ lr = 0.05
 """
 '''
 ENTRY_POINTS = (
-    "[invgraphics.fields]\nfog = stranger_fog:FogConfig\n\n[invgraphics.renderers]\nexposed = stranger_fog:ExposedConfig\n\n"
-    "[invgraphics.recipes]\nvolumetric/fog = stranger_fog:RECIPE\nexposed/fog = stranger_fog:EXPOSED\n"
+    "[invgraphics.fields]\nfog = third_party_fog:FogConfig\n\n"
+    "[invgraphics.renderers]\nexposed = third_party_fog:ExposedConfig\n\n"
+    "[invgraphics.recipes]\nvolumetric/fog = third_party_fog:RECIPE\nexposed/fog = third_party_fog:EXPOSED\n"
 )
 
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """A process environment in which the stranger's package is installed."""
-    info = tmp_path_factory.mktemp("site") / "stranger_fog-1.0.dist-info"
+    """A process environment in which the third-party package is installed."""
+    info = tmp_path_factory.mktemp("site") / "third_party_fog-1.0.dist-info"
     info.mkdir()
-    (info.parent / "stranger_fog.py").write_text(MODULE)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger-fog\nVersion: 1.0\n")
+    (info.parent / "third_party_fog.py").write_text(MODULE)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: third-party-fog\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(ENTRY_POINTS)
     paths = [str(info.parent), str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "200"}
@@ -119,8 +120,8 @@ for words in json.loads(sys.argv[1]):
 
 
 @dataclass(frozen=True)
-class Stranger:
-    """What commands printed in a process that has the stranger's package, and the folders that they wrote."""
+class Commands:
+    """What commands printed in a process that has the third-party package, and the folders that they wrote."""
 
     listed: str
     compared: str
@@ -133,9 +134,9 @@ class Stranger:
 
 
 @pytest.fixture(scope="module")
-def stranger(environment: dict[str, str], toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Stranger:
+def commands(environment: dict[str, str], toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Commands:
     """All commands in one process, comparisons' fits too: starting one takes longer than they do."""
-    out = tmp_path_factory.mktemp("stranger") / "report"
+    out = tmp_path_factory.mktemp("commands") / "report"
     methods = "volumetric/fog,exposed/fog"
     words = ["--budget", "20steps", "--out", str(out), "--methods", methods, "--render-with", "exposed/fog"]
     ours, theirs = (out / "runs" / name / "seed-0" for name in ("volumetric-fog", "exposed-fog"))
@@ -150,18 +151,18 @@ def stranger(environment: dict[str, str], toy_folder: Path, tmp_path_factory: py
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     listed, compared, *explained, _, _ = done.stdout.split("\f")
-    return Stranger(listed, compared, tuple(explained), out, ours, theirs, shown, lone)
+    return Commands(listed, compared, tuple(explained), out, ours, theirs, shown, lone)
 
 
-def test_a_strangers_field_and_renderer_with_state_take_part(stranger: Stranger) -> None:
+def test_a_field_and_a_renderer_with_state_take_part(commands: Commands) -> None:
     """Listed, fitted, compared with ours, shown beside it for a field that ours fitted, reported and explained."""
-    ours, theirs, shown = stranger.ours, stranger.theirs, stranger.shown
-    listed = stranger.listed
-    assert "| exposed volume rendering |" in listed and "stranger_fog:ExposedConfig" in listed
-    assert "stranger_fog:FogConfig" in listed and "stranger-fog" in listed and "volumetric/fog" in listed
-    assert "exposed/fog" in stranger.compared
-    page = (stranger.report / "index.html").read_text()
-    assert "Even fog from a stranger" in page and "Exposed fog from a stranger" in page
+    ours, theirs, shown = commands.ours, commands.theirs, commands.shown
+    listed = commands.listed
+    assert "| exposed volume rendering |" in listed and "third_party_fog:ExposedConfig" in listed
+    assert "third_party_fog:FogConfig" in listed and "third-party-fog" in listed and "volumetric/fog" in listed
+    assert "exposed/fog" in commands.compared
+    page = (commands.report / "index.html").read_text()
+    assert "Even fog of a third party" in page and "Exposed fog of a third party" in page
     assert [json.loads((run / "scores.json").read_text())["cost"]["parameters"] for run in (ours, theirs)] == [4, 5]
     state = checkpoint.load(theirs / CHECKPOINT)
     assert abs(float(state["renderer"]["log_exposure"])) > 0.01, "the renderer has learnt nothing"
@@ -169,26 +170,26 @@ def test_a_strangers_field_and_renderer_with_state_take_part(stranger: Stranger)
     assert json.loads((shown / "scores.json").read_text())["method"] == "volumetric/fog rendered with exposed/fog"
     with np.load(ours / "test" / "0000.npz") as own, np.load(shown / "test" / "0000.npz") as other:
         np.testing.assert_allclose(own["rgb"], other["rgb"], atol=1e-3)
-    assert len(stranger.explained) == 2 and all("8 samples" in text for text in stranger.explained)
+    assert len(commands.explained) == 2 and all("8 samples" in text for text in commands.explained)
     for run in (theirs, shown):
         pixel = json.loads((run / "explained" / "test-0000-12-12" / "ray.json").read_text())["pixel"]
         assert pixel["composited"] == pytest.approx(pixel["rendered"], abs=1e-5)
 
 
-def test_a_run_whose_package_is_gone_names_it(stranger: Stranger, capsys: pytest.CaptureFixture[str]) -> None:
-    plugins = {"fog": "stranger-fog 1.0", "volumetric/fog": "stranger-fog 1.0"}
-    assert json.loads((stranger.lone / "provenance.json").read_text())["plugins"] == plugins
+def test_a_run_whose_package_is_gone_names_it(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    plugins = {"fog": "third-party-fog 1.0", "volumetric/fog": "third-party-fog 1.0"}
+    assert json.loads((commands.lone / "provenance.json").read_text())["plugins"] == plugins
     # Only that process had the package.
-    assert main.run(["evaluate", str(stranger.lone)]) == main.BAD_INPUT
+    assert main.run(["evaluate", str(commands.lone)]) == main.BAD_INPUT
     said = capsys.readouterr().err
-    assert "was made with stranger-fog 1.0, which provides 'fog', 'volumetric/fog' and is not installed here" in said
+    assert "was made with third-party-fog 1.0, which provides 'fog', 'volumetric/fog' and is not installed here" in said
 
 
-def test_a_stranger_that_fails_to_import_is_named(environment: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "stranger_fog.py").write_text("import a_module_that_is_not_there\n")
+def test_a_package_that_fails_to_import_is_named(environment: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "third_party_fog.py").write_text("import a_module_that_is_not_there\n")
     environment = environment | {"PYTHONPATH": os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])}
     command = [sys.executable, "-m", "invgraphics", "fit", "volumetric/fog", "bricks", "--out", str(tmp_path / "run")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "stranger-fog" in done.stderr and "a_module_that_is_not_there" in done.stderr
+    assert "third-party-fog" in done.stderr and "a_module_that_is_not_there" in done.stderr
     assert "Traceback" not in done.stderr
