@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +14,7 @@ import pytest
 import torch
 
 from invgraphics.core import Bounds, Camera, Points, Scene, View
+from invgraphics.errors import InputError
 from invgraphics.scenes.degrade import ENOUGH_POINTS, TrainingData, degrade
 from invgraphics.scenes.photos import triangulate as sfm
 
@@ -190,3 +194,54 @@ def test_a_triangulation_of_many_photographs_is_announced_once(
     ):
         sfm.triangulated(plane)
         assert capsys.readouterr().err == expected
+
+
+def test_points_are_made_where_the_cache_cannot_be_written(
+    plane: Scene, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They were lost where only their file could not be written, and nothing was announced where its folder could not."""
+    found = sfm.Triangulated.of(Points(torch.rand(9, 3), torch.rand(9, 3)), torch.zeros(2, 0, dtype=torch.int64), CAMERAS)
+    monkeypatch.setattr(sfm, "triangulate", lambda scene: found)
+    monkeypatch.setattr(sfm, "MANY", CAMERAS)
+
+    def full(*_: object) -> None:
+        raise InputError("'points.npz' cannot be written: the disk is full.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sfm, "write_arrays", full)
+        assert sfm.triangulated(plane) is found
+    assert capsys.readouterr().err.endswith("The points are not cached: 'points.npz' cannot be written: the disk is full.\n")
+    for name, owner in (("root", sfm.cache), ("locked", sfm.locks)):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, lambda *_, **__: (_ for _ in ()).throw(PermissionError("permission denied")))
+            assert sfm.triangulated(plane) is found
+        assert "; not cached, as the cache cannot be written." in capsys.readouterr().err
+
+
+def test_damaged_points_in_the_cache_are_made_again(plane: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    found = sfm.Triangulated.of(Points(torch.rand(9, 3), torch.rand(9, 3)), torch.zeros(2, 0, dtype=torch.int64), CAMERAS)
+    monkeypatch.setattr(sfm, "triangulate", lambda scene: found)
+    sfm.triangulated(plane)
+    file = next(tmp_path.rglob("points/*.npz"))
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    assert sfm.triangulated(plane) is found
+    monkeypatch.setattr(sfm, "triangulate", lambda scene: pytest.fail("computed again"))
+    assert torch.equal(sfm.triangulated(plane).points.position, found.points.position)
+
+
+def test_one_of_two_processes_makes_the_points(plane: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both did, and the second to finish could find its temporary file gone."""
+    found = sfm.Triangulated.of(Points(torch.rand(9, 3), torch.rand(9, 3)), torch.zeros(2, 0, dtype=torch.int64), CAMERAS)
+    calls: list[int] = []
+
+    def slowly(scene: Scene) -> sfm.Triangulated:
+        calls.append(threading.get_ident())
+        time.sleep(0.3)
+        return found
+
+    monkeypatch.setattr(sfm, "triangulate", slowly)
+    with ThreadPoolExecutor(2) as pool:  # locks are of threads, too
+        results = list(pool.map(sfm.triangulated, [plane, plane]))
+    assert len(calls) == 1
+    assert all(torch.equal(result.points.position, found.points.position) for result in results)

@@ -10,6 +10,7 @@ import hashlib
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from jaxtyping import Int
 from PIL import Image
 from torch import Tensor
 
+from invgraphics import locks
 from invgraphics.arrays import read_arrays
 from invgraphics.core import Points, Scene, View
 from invgraphics.core.colour import linear_to_srgb, quantise
@@ -65,7 +67,8 @@ class Triangulated:
 def triangulated(scene: Scene) -> Triangulated:
     """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else.
 
-    A triangulation of many photographs is announced on stderr.
+    A triangulation of many photographs is announced on stderr. Of several processes that need the same one, one makes it. A
+    cache that cannot be written costs the next process the same time, and is said; a damaged file in it is made again.
     """
     sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
     for view in scene.train:
@@ -74,19 +77,45 @@ def triangulated(scene: Scene) -> Triangulated:
     try:
         folder = cache.root().parent / "points"
         folder.mkdir(exist_ok=True)
-        path = folder / f"{sha.hexdigest()[:32]}.npz"
-        if path.is_file():
-            arrays = read_arrays(path)
-            position, rgb, tracks = (torch.from_numpy(arrays[name]) for name in ("position", "rgb", "tracks"))
-            return Triangulated.of(Points(position, rgb), tracks, len(scene.train))
-    except (InputError, OSError, KeyError):  # no cache, or what is in it is damaged
-        return triangulate(scene)
+    except (InputError, OSError):
+        return _announced(scene, cached=False)
+    path = folder / f"{sha.hexdigest()[:32]}.npz"
+    found = _read(path, len(scene.train))
+    if found is not None:
+        return found
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locks.locked(path, waiting=lambda holder: None))
+        except (InputError, OSError):
+            return _announced(scene, cached=False)
+        found = _read(path, len(scene.train))
+        if found is not None:
+            return found
+        found = _announced(scene, cached=True)
+        try:
+            write_arrays(path, found.arrays())
+        except (InputError, OSError) as error:
+            print(f"The points are not cached: {error}", file=sys.stderr)
+        return found
+
+
+def _read(path: Path, views: int) -> Triangulated | None:
+    """Read points from the cache; ``None`` where they are not there, or damaged."""
+    try:
+        arrays = read_arrays(path) if path.is_file() else {}
+        position, rgb, tracks = (torch.from_numpy(arrays[name]) for name in ("position", "rgb", "tracks"))
+        return Triangulated.of(Points(position, rgb), tracks, views)
+    except (InputError, OSError, KeyError):
+        return None
+
+
+def _announced(scene: Scene, cached: bool) -> Triangulated:
+    """Triangulate; before that, what will take a while is printed on stderr, and whether it will be ``cached``."""
     if len(scene.train) >= MANY:
         what = f"{scene.name}: finding points in {len(scene.train)} training photographs (structure from motion)"
-        print(f"{what}; cached afterwards.", file=sys.stderr, flush=True)
-    found = triangulate(scene)
-    write_arrays(path, found.arrays())
-    return found
+        after = "cached afterwards" if cached else "not cached, as the cache cannot be written"
+        print(f"{what}; {after}.", file=sys.stderr, flush=True)
+    return triangulate(scene)
 
 
 def triangulate(scene: Scene, seed: int = 0) -> Triangulated:
