@@ -1,4 +1,4 @@
-"""Processes that test side by side share the cores: with more threads than cores, training takes twice as long.
+"""Processes that test side by side share the cores: with more threads than cores, training takes 1.4 times as long.
 
 ``tests/kernels`` takes all cores, see its ``conftest.py``.
 """

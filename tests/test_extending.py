@@ -110,7 +110,7 @@ def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable:
         "names = ['volumetric/voxels', 'brightest/voxels']\n"
         "methods = [ig.load_method(name, set=small) for name in names]\n"
         f"out = {str(tmp_path / 'report')!r}\n"
-        "report = ig.compare(scene, methods, budget='120steps', out=out, render_with=['brightest/voxels'])\n"
+        "report = ig.compare(scene, methods, budget='250steps', out=out, render_with=['brightest/voxels'])\n"
         "print(len(scene.train), len(scene.test), report.failures, *[report.scores(name)['psnr'] for name in report.methods])\n"
         "print((report.run(report.methods[0]).through('brightest/voxels')).render(scene.test[0].camera).rgb.shape)\n"
     )

@@ -15,8 +15,6 @@ from invgraphics.runs.study import CellRecord
 from invgraphics.studies import ablate as module
 from invgraphics.studies.forecast import Forecast
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 LONG, SHORT = Forecast(90, 80, 5 * 3600.0, 3 * 10**9), Forecast(9, 8, 600.0, 10**6)
 
 

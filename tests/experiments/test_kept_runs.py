@@ -22,8 +22,6 @@ from invgraphics.recipes.recipe import load_method
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.training.budget import Budget
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 METHOD = "splatting/gaussians"
 
 

@@ -36,8 +36,6 @@ from invgraphics.studies.cells import make_plan
 from invgraphics.studies.reading import read_study
 from invgraphics.testing import toy_scene
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 METHOD = "splatting/gaussians"
 RAY = "gaussian-volume/sorted:opacity=splat"
 OTHERS = (RAY, METHOD, "gaussian-volume/exact:steps=8")

@@ -1,15 +1,16 @@
 """Kernels are tested with as many threads as there are cores, whatever else runs: their threads must not disturb each other."""
 
-import os
 from collections.abc import Iterator
 
 import pytest
 import torch
 
+from invgraphics.experiments.executors.local import cores
+
 
 @pytest.fixture(autouse=True)
 def _all_cores() -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(cores())
     yield
     torch.set_num_threads(before)

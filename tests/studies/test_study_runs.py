@@ -21,8 +21,6 @@ from invgraphics.studies.ablate import ablate
 from invgraphics.studies.forecast import START_SECONDS, Cost, Forecast, total, try_method
 from invgraphics.training.budget import Budget
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 METHOD = "splatting/gaussians"
 VIEWS = "data.train_views"
 

@@ -13,8 +13,6 @@ from invgraphics.scenes.photos import PhotoJob
 from invgraphics.tools import photos as module
 from invgraphics.tools.photos import compare, import_photos
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 

@@ -33,8 +33,6 @@ from invgraphics.tools.recipe_check import check_recipes
 from invgraphics.training.codes.inference import CodeInference, infer_codes
 from invgraphics.training.codes.penalty import CodePenalty
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 CPU = torch.device("cpu")
 
 

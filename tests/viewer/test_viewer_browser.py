@@ -43,7 +43,7 @@ KNOWN = (
 )
 """Warnings of viser's own page."""
 PATIENCE = 60_000
-WINDOW = {"width": 720, "height": 440}
+WINDOW = {"width": 900, "height": 520}
 METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
 
 
@@ -88,7 +88,7 @@ class Watcher:
             if np.array_equal(now, before):
                 return
             before = now
-            self.page.wait_for_timeout(250)
+            self.page.wait_for_timeout(500)
         raise AssertionError("the picture does not come to rest")
 
     def choose(self, label: str, option: str) -> None:

@@ -27,7 +27,7 @@ from invgraphics.experiments.session import FolderRun
 from invgraphics.recipes.recipe import Method, expand
 from invgraphics.report.build import build_report
 from invgraphics.report.data.comparison import Comparison, read_comparison
-from invgraphics.report.statistics.summary import summarise
+from invgraphics.report.statistics.summary import Summary, summarise
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.folder import RunFolder
 
@@ -50,6 +50,10 @@ class ComparisonResult:
     def record(self) -> Comparison:
         """The comparison's record, from which the report is written."""
         return read_comparison(self.folder)
+
+    @cached_property
+    def _summary(self) -> Summary:
+        return summarise(self.record)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -87,7 +91,7 @@ class ComparisonResult:
 
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Summary table of the report: headings, and a row of texts for each method and baseline; * marks significant leads."""
-        summary = summarise(self.record)
+        summary = self._summary
         rows = [[row.label, *(f"{cell.text}{' *' if cell.best else ''}" for cell in row.cells)] for row in summary.rows]
         return ["", *(column.heading for column in summary.columns)], rows
 
@@ -96,7 +100,7 @@ class ComparisonResult:
         return f"{self.record.question} {len(self.record.runs)} runs{failed}: {self.page}"
 
     def _repr_html_(self) -> str:
-        return table_html(f"{self.record.question} {summarise(self.record).legend}".strip(), *self.table())
+        return table_html(f"{self.record.question} {self._summary.legend}".strip(), *self.table())
 
 
 def compare(

@@ -67,8 +67,8 @@ class Triangulated:
 def triangulated(scene: Scene) -> Triangulated:
     """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else.
 
-    A triangulation of many photographs is announced on stderr. Of several processes that need the same one, one makes it. A
-    cache that cannot be written costs the next process the same time, and is said; a damaged file in it is made again.
+    A triangulation of many photographs is announced on stderr. Of several processes that need the same one, one makes it.
+    Where the cache cannot be written, stderr says so and the points are returned all the same; a damaged file is replaced.
     """
     sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
     for view in scene.train:
