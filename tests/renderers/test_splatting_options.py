@@ -9,6 +9,7 @@ from test_splatting import BOUNDS, F64, Fixed, gaussians
 
 from invgraphics.core import Bounds, Camera, Context, Gaussians
 from invgraphics.core.transforms import look_at, quaternion_to_matrix
+from invgraphics.renderers.base import normals_from_depth, to_rendering
 from invgraphics.renderers.gaussians.ellipsoids import draw_ellipsoids
 from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.testing import toy_scene
@@ -56,6 +57,24 @@ def test_normals_from_depth_are_those_of_the_plane(make_camera: Callable[..., Ca
         middle = rendering.normal[6:14, 7:17]
         assert float(middle[..., 1].mean()) < -0.98
         torch.testing.assert_close(middle.norm(dim=-1), torch.ones_like(middle[..., 0]))
+
+
+def test_normals_from_depth_are_those_of_a_ball(make_camera: Callable[..., Camera]) -> None:
+    """Of the exact distance to a ball, up to its silhouette, where the surface is oblique to the ray."""
+    view = make_camera(120, 100, 200.0)
+    rays = view.rays()
+    towards = (rays.origins * rays.directions).sum(dim=1)
+    under = towards**2 - rays.origins.square().sum(dim=1) + 1
+    seen = under > 0
+    distance = torch.where(seen, -towards - under.clamp_min(0).sqrt(), 0)
+    directions, seen = rays.directions.view(100, 120, 3), seen.view(100, 120)
+    normal = normals_from_depth(distance.view(100, 120), seen, directions)
+    facing = to_rendering(normal, seen.double(), distance.view(100, 120), normal, distance.view(100, 120), directions).normal
+    true = rays.origins.view(100, 120, 3) + distance.view(100, 120, 1) * directions
+    for found in (normal, facing):
+        error = torch.rad2deg((found * true).sum(dim=-1)[seen].clamp(-1, 1).acos())
+        assert seen.sum() > 1000 and float(error.mean()) < 1
+        assert float((error > 20).double().mean()) < 0.01
 
 
 def test_discs_agree_with_ellipses_where_both_are_small(make_camera: Callable[..., Camera]) -> None:

@@ -55,13 +55,13 @@ def _facing(normal: Float[Tensor, "*p 3"], directions: Float[Tensor, "*p 3"]) ->
 
 
 def normals_from_depth(depth: Float[Tensor, "h w"], seen: Tensor, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Normals of a depth map by central differences of its points, one-sided where a neighbour is empty.
+    """Normals of a depth map, towards the camera, by central differences of its points, one-sided where a neighbour is empty.
 
     A pixel without a neighbour in one direction gets its own viewing direction, reversed.
     """
     points = depth[..., None] * directions
     along_x, along_y = _difference(points, seen, 1), _difference(points, seen, 0)
-    normal = normalize(torch.linalg.cross(along_x, along_y), dim=-1)
+    normal = normalize(torch.linalg.cross(along_y, along_x), dim=-1)  # x right and y down: x cross y points away
     alone = normal.square().sum(dim=-1, keepdim=True) < 0.5  # of a unit vector or zero
     return torch.where(alone, -directions, normal)
 
