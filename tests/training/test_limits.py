@@ -1,22 +1,25 @@
 """Gaussians that no gradient could change: one of each kind is made, and a step or two of a fit must bring it back."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from test_density_control import _scene
 
 from invgraphics.core import Model, harmonics
+from invgraphics.core.camera import pixel_sizes
 from invgraphics.fields.gaussian import PARAMETERS, GaussianField
 from invgraphics.kernels.dispatch import using
 from invgraphics.renderers.splatting import SplattingConfig
 from invgraphics.training.batches import BatchConfig
 from invgraphics.training.budget import Budget
 from invgraphics.training.fit import Fit, Plan
+from invgraphics.training.hooks import FitState, Hook
 from invgraphics.training.limits import COLLAPSED, LimitsConfig, dead_gaussians
 from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import GroupConfig, OptimiserConfig
+from invgraphics.training.rows import replace_rows
 
 
 def _fit(colour: float, target: int, hooks: tuple = (LimitsConfig(),), **changes: float) -> Fit:
@@ -118,6 +121,57 @@ def test_limits_survive_an_interruption_bit_by_bit() -> None:
         second.step()
     for name in PARAMETERS:
         assert torch.equal(getattr(whole.plan.model.field, name), getattr(second.plan.model.field, name)), name
+
+
+@dataclass(frozen=True)
+class _Swap(Hook):
+    """Swaps two Gaussians after a step, as density control at its cap does: rows move, their number stays."""
+
+    name = "swap"
+    at: int
+
+    def build(self) -> Hook:
+        return self
+
+    def after_step(self, state: FitState) -> None:
+        if state.step == self.at:
+            rows = {name: getattr(state.field, name).detach().flip(0) for name in PARAMETERS}
+            replace_rows(state, rows, torch.tensor([1, 0]), 0)
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_limits_follow_rows_that_move(last: bool) -> None:
+    """A Gaussian near a camera may be finer than a distant one, wherever its row goes, and after an interruption too."""
+    hooks = (LimitsConfig(), _Swap(4)) if last else (_Swap(4), LimitsConfig())
+
+    def made() -> Fit:
+        fit = _fit(1.0, 255, hooks=hooks, log_scale=-18.0)
+        field = fit.plan.model.field
+        field.replace({name: getattr(field, name).detach().repeat_interleave(2, dim=0) for name in PARAMETERS})
+        with torch.no_grad():
+            field.means[1] *= 0
+            field.means[1, 2] = -30.0
+        return Fit(fit.plan)
+
+    fit = made()
+    for _ in range(5 + last):
+        fit.step()
+    means, log_scales = fit.plan.model.field.means.detach(), fit.plan.model.field.log_scales.detach()
+    sizes = pixel_sizes(means, [view.camera for view in fit.plan.scene.train])
+    near = int(sizes.argmin())
+    assert sizes.max() > 5 * sizes.min()
+    assert float(log_scales[near].max()) < float((0.1 * sizes).log().max()) - 1
+    resumed = made()
+    first = made()
+    for _ in range(5):
+        first.step()
+    resumed.load({part: {k: v.clone() for k, v in tensors.items()} for part, tensors in first.state().items()}, 0.0)
+    for _ in range(3):
+        resumed.step()
+    for _ in range(3 - last):
+        fit.step()
+    for name in PARAMETERS:
+        assert torch.equal(getattr(fit.plan.model.field, name), getattr(resumed.plan.model.field, name)), name
 
 
 def test_causes_are_told_apart() -> None:

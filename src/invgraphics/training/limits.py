@@ -39,7 +39,7 @@ class LimitsConfig:
             what density control and relocation take for transparent (0.005).
         max_opacity: highest opacity. The rasteriser clamps alpha at 0.99.
         min_scale: lowest standard deviation along any axis, in pixels of the nearest training camera.
-        every: steps between two computations of the scale limits; there is one more after each change in number.
+        every: steps between two computations of the scale limits; there is one more after each replacement of rows.
     """
 
     min_opacity: float = 0.0045
@@ -67,25 +67,34 @@ class Limits(Hook):
     def __init__(self, config: LimitsConfig) -> None:
         self._config = config
         self._log_limit = torch.zeros(0)
+        self._field: GaussianParameters | None = None
+        self._means: Tensor | None = (
+            None  # those that the limits are of: density control may replace rows, yet keep their number
+        )
 
     @override
     @torch.no_grad()
     def after_step(self, state: FitState) -> None:
         config, field = self._config, cast(GaussianParameters, state.field)
         field.opacity_logits.clamp_(_logit(config.min_opacity), _logit(config.max_opacity))
-        if config.min_scale:
-            if len(self._log_limit) != len(field.means) or state.step % config.every == 0:
-                sizes = pixel_sizes(field.means, state.cameras())
-                self._log_limit = (config.min_scale * sizes).clamp_min(SMALLEST).log()
-            torch.maximum(field.log_scales, self._log_limit[:, None], out=field.log_scales)
+        if not config.min_scale:
+            return
+        replaced = self._means is not None and self._means is not field.means
+        if replaced or len(self._log_limit) != len(field.means) or state.step % config.every == 0:
+            sizes = pixel_sizes(field.means, state.cameras())
+            self._log_limit = (config.min_scale * sizes).clamp_min(SMALLEST).log()
+        self._field, self._means = field, field.means
+        torch.maximum(field.log_scales, self._log_limit[:, None], out=field.log_scales)
 
     @override
     def state_dict(self) -> dict[str, Tensor]:
-        return {"log_limit": self._log_limit}
+        """The limits; none where a later hook has replaced the rows that they are of."""
+        replaced = self._field is not None and self._means is not self._field.means
+        return {"log_limit": self._log_limit.new_zeros(0) if replaced else self._log_limit}
 
     @override
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self._log_limit = state["log_limit"]
+        self._log_limit, self._field, self._means = state["log_limit"], None, None
 
 
 def _logit(opacity: float) -> float:
