@@ -212,7 +212,7 @@ def _normals(picture: Rendering, change: Callable[[Tensor], Tensor]) -> Renderin
         (_straight, "colours are not premultiplied"),
         (lambda p: _normals(p, lambda normal: 0.5 * normal), "a normal is neither of unit length nor 0"),
         (lambda p: _normals(p, lambda normal: normalize(normal + 1e-3, dim=-1)), "there is a normal where alpha is below"),
-        (lambda p: replace(p, depth=torch.where(p.alpha < 0.5, 0.0, p.depth)), "depth must be far where alpha is below"),
+        (lambda p: replace(p, depth=torch.where(p.alpha < 0.5, 0.0, p.depth)), "depth must be infinite where alpha is below"),
         (lambda p: replace(p, alpha=2 * p.alpha), r"alpha leaves \[0, 1\]"),
     ],
     ids=["straight", "short", "everywhere", "near", "above"],

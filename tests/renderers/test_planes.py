@@ -12,7 +12,7 @@ from torch import Tensor
 from invgraphics import kernels
 from invgraphics.core import Camera, Context, Field, Planes, Quantity, Samples, Scene, View
 from invgraphics.core.compositing import layer_alphas_from_weights
-from invgraphics.core.planes import homographies, inverse_depths, mean_camera, widened, widest_angle
+from invgraphics.core.planes import homographies, homographies_to, inverse_depths, mean_camera, widened, widest_angle
 from invgraphics.core.transforms import look_at, transform_points
 from invgraphics.errors import InputError
 from invgraphics.fields.plane_sweep import plane_sweep
@@ -74,6 +74,28 @@ def test_homographies_agree_with_projection() -> None:
         assert float((mapped[:, :2] / mapped[:, 2:] - there).abs().max()) < 1e-6
     # The third coordinate is that of the ray, scaled to z = 1 before the camera, times the plane's depth.
     assert float((mapped[:, 2] - DEPTHS[-1] * _ray_z(reference, camera, here)).abs().max()) < 1e-9
+
+
+@pytest.mark.parametrize("forward", [0.0, 2.0, 5.0])
+def test_homographies_to_a_camera_know_what_is_behind_it(forward: float) -> None:
+    """Also of a camera that has passed some of the planes, and of one in a plane."""
+    reference = camera_at((0.1, -3.5, 0.2), 640, 480, 500.0)
+    pose = camera_at((-0.6, -3.1, 0.5), 320, 240, 300.0).cam_to_world.clone()
+    pose[:3, 3] += forward * reference.cam_to_world[:3, 2]
+    camera = replace(camera_at((-0.6, -3.1, 0.5), 320, 240, 300.0), cam_to_world=pose)
+    depths = torch.cat([DEPTHS, ((camera.position - reference.position) @ reference.cam_to_world[:3, 2])[None]])
+    pixels = torch.rand(50, 2, dtype=torch.float64) * reference.focal.new_tensor([640, 480])
+    rays = reference.rays(pixels)
+    along = rays.directions @ reference.cam_to_world[:3, 2]
+    behind = 0
+    for depth, to_camera in zip(depths, homographies_to(reference, depths, camera), strict=True):
+        there, z = camera.project(rays.origins + (depth / along)[:, None] * rays.directions)
+        mapped = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1) @ to_camera.T
+        torch.testing.assert_close(mapped[:, 2], z)
+        before = z > 1e-3
+        torch.testing.assert_close(mapped[before, :2] / mapped[before, 2:], there[before])
+        behind += int((z < 0).sum())
+    assert (behind > 0) == (forward > 0)
 
 
 def _ray_z(reference: Camera, camera: Camera, pixels: Tensor) -> Tensor:

@@ -73,6 +73,16 @@ def homographies(reference: Camera, depths: Float[Tensor, " p"], camera: Camera)
     return _intrinsics(reference) @ (along_z + offsets * eye) @ (rotation @ _inverse_intrinsics(camera))
 
 
+def homographies_to(reference: Camera, depths: Float[Tensor, " p"], camera: Camera) -> Float[Tensor, "p 3 3"]:
+    """Homographies from ``reference``'s image points to those of ``camera``, one for each plane: inverses of `homographies`.
+
+    The third coordinate is the depth of the plane's point along the axis of ``camera``, positive before it.
+    """
+    moved = camera.world_to_cam @ reference.cam_to_world
+    origin = torch.cat([torch.zeros_like(moved[:3, :2]), moved[:3, 3:]], dim=1)
+    return _intrinsics(camera) @ (moved[:3, :3] @ (depths[:, None, None] * _inverse_intrinsics(reference)) + origin)
+
+
 def _intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
     """The calibration matrix K, from camera axes to homogeneous image points."""
     (fx, fy), (cx, cy) = camera.focal, camera.principal_point

@@ -134,7 +134,7 @@ class GaussianField(Field):
     Args:
         tensors: one per name in `PARAMETERS`, all with n rows.
         isotropic: whether all three axes of a Gaussian are kept equal (their mean log-scale counts).
-        dropout: share of Gaussians left out of a training step at the end of a fit.
+        dropout: share of Gaussians left out of a training step at the end of a fit, by renderers of `primitives` only.
     """
 
     provides = Quantity.GAUSSIANS | Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from invgraphics.core import Camera, Scene, View
 from invgraphics.core.compositing import layer_alphas_from_weights
-from invgraphics.core.planes import homographies, warp
+from invgraphics.core.planes import homographies_to, warp
 
 WHOLE = 0.999
 """Share of the pixels around a texel's image that must be valid (`View.mask`) for it to be seen."""
@@ -40,8 +40,7 @@ def plane_sweep(
     for view in chosen:
         mask = torch.ones(view.image.shape[:2]) if view.mask is None else view.mask.float()
         layers = torch.cat([premultiplied(view), mask[None]])
-        # The third coordinate of the inverse is positive where that of the map is: before the view, on planes before it.
-        maps = torch.linalg.inv(homographies(camera, depths, view.camera))
+        maps = homographies_to(camera, depths, view.camera)
         for plane, to_view in enumerate(maps):
             values, inside, _ = warp(layers[None], to_view[None], size)
             rgb, alpha = values[0, :3], values[0, 3]

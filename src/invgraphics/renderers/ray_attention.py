@@ -31,7 +31,7 @@ from invgraphics.core import (
 from invgraphics.core.spacing import from_spacing, to_spacing
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.ray_normals import normals_from_distances
-from invgraphics.renderers.samplers import hit_indices, pack_intervals, stratified_edges
+from invgraphics.renderers.samplers import hit_indices, pack_intervals, stratified_edges, unit_ball_exit
 from invgraphics.renderers.srn import pixel_network
 from invgraphics.renderers.volumetric import query
 
@@ -122,7 +122,7 @@ class RayAttention(RayRenderer):
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; with normals, from the mean distances of neighbouring rays, if ``ctx.geometry`` is set."""
-        rays = ctx.bounds.clip(rays)
+        far, rays = rays.far, ctx.bounds.clip(rays)
         hit = hit_indices(rays)
         samples, tokens = self._tokens(field, rays, hit, ctx)
         weights = self.weights(tokens)
@@ -135,7 +135,7 @@ class RayAttention(RayRenderer):
         normal = None
         if ctx.geometry:
             normal = self._normals(field, rays, sums[:, 3] / sums[:, 4].clamp_min(1e-6), replace(ctx, training=False))
-        return to_rendering(sums[:, :3], sums[:, 4], sums[:, 3], normal, rays.far, rays.directions), trace
+        return to_rendering(sums[:, :3], sums[:, 4], sums[:, 3], normal, far, rays.directions), trace
 
     def weights(self, tokens: Float[Tensor, "k s w"]) -> Float[Tensor, "k s"]:
         """Share of each sample in its ray's light; the sum over a ray is its opacity."""
@@ -144,12 +144,13 @@ class RayAttention(RayRenderer):
 
     def _tokens(self, field: Field, rays: Rays, hit: Int[Tensor, " k"], ctx: Context) -> tuple[Samples, Float[Tensor, "k s w"]]:
         """Samples of the rays ``hit``, and their tokens after the transformer."""
-        edges = stratified_edges(rays[hit], self.config.samples, ctx)
-        samples = pack_intervals(rays, hit, from_spacing(edges, ctx.bounds))
+        transition = unit_ball_exit(rays[hit], ctx.bounds)
+        edges = stratified_edges(rays[hit], self.config.samples, ctx, transition)
+        samples = pack_intervals(rays, hit, from_spacing(edges, ctx.bounds, transition))
         features = query(field, samples, Quantity.FEATURES, ctx.chunk).features
         assert features is not None
         near, far = edges[:, :1], edges[:, -1:]
-        place = (to_spacing(samples.mid, ctx.bounds).view(len(hit), self.config.samples) - near) / (far - near)
+        place = (to_spacing(samples.mid.view(len(hit), self.config.samples), ctx.bounds, transition) - near) / (far - near)
         phases = place[..., None] * math.pi * 2.0 ** torch.arange(self.config.octaves, device=place.device)
         where = torch.cat([place[..., None], phases.sin(), phases.cos()], dim=2)
         tokens = torch.cat([features.view(*place.shape, self.config.features), where], dim=2)

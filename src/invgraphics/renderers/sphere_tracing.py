@@ -126,20 +126,21 @@ class SphereTracing(RayRenderer):
         fused = None if torch.is_grad_enabled() else _fused(field, ctx)
         if fused is None:
             return None
-        rays, limits = ctx.bounds.clip(camera.rays()), self.limits(ctx)
+        unclipped, limits = camera.rays(), self.limits(ctx)
+        rays = ctx.bounds.clip(unclipped)
         traced = kernels.sdf_trace(_skip_free_space(rays, ctx.bounds, fused, limits), ctx.bounds, fused, limits)
-        rendering, trace = self._shade(field, rays, traced, limits, ctx)
+        rendering, trace = self._shade(field, rays, traced, limits, ctx, unclipped.far)
         return rendering.reshape(camera.height, camera.width), trace
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; with normals if ``ctx.geometry`` is set."""
-        rays, limits = ctx.bounds.clip(rays), self.limits(ctx)
-        return self._shade(field, rays, _trace(field, rays, limits, ctx), limits, ctx)
+        clipped, limits = ctx.bounds.clip(rays), self.limits(ctx)
+        return self._shade(field, clipped, _trace(field, clipped, limits, ctx), limits, ctx, rays.far)
 
     def _shade(
-        self, field: Field, rays: Rays, traced: TracedRays, limits: TracingLimits, ctx: Context
+        self, field: Field, rays: Rays, traced: TracedRays, limits: TracingLimits, ctx: Context, far: Float[Tensor, " n"]
     ) -> tuple[Rendering, Trace]:
-        """Render n rays of which it is known where they meet the surface."""
+        """Render n rays of which it is known where they meet the surface; those that meet none have the depth ``far``."""
         sharpness = SATURATION / limits.depth
         logit = -sharpness * _lowest(field, rays, traced, ctx)
         surface = SurfaceTrace(logit, sharpness, traced.hit, traced.steps, traced.converged)
@@ -150,7 +151,7 @@ class SphereTracing(RayRenderer):
         want = Quantity.RADIANCE | (Quantity.GRADIENT if ctx.geometry else Quantity.NONE)
         values = query(field, samples, want, ctx.chunk)
         trace = Trace(samples, values, alpha[seen], rays=len(rays), surface=surface)
-        return _picture(rays, trace, alpha), trace
+        return _picture(rays, trace, alpha, far), trace
 
     @override
     def contributions(self, field: Field, camera: Camera, pixel: tuple[int, int], ctx: Context) -> Contributions:
@@ -192,7 +193,7 @@ def _trace(field: Field, rays: Rays, limits: TracingLimits, ctx: Context) -> Tra
     return sphere_trace(distance, rays, limits)
 
 
-def _picture(rays: Rays, trace: Trace, alpha: Float[Tensor, " n"]) -> Rendering:
+def _picture(rays: Rays, trace: Trace, alpha: Float[Tensor, " n"], far: Float[Tensor, " n"]) -> Rendering:
     """The rendering of rays with at most one surface point each."""
     samples, values, weights = trace.samples, trace.values, trace.weights
     assert samples is not None
@@ -205,7 +206,7 @@ def _picture(rays: Rays, trace: Trace, alpha: Float[Tensor, " n"]) -> Rendering:
 
     distance = spread(samples.t0[:, None])[:, 0]
     normal = None if values.gradient is None else spread(normalize(values.gradient, dim=1))
-    return to_rendering(spread(values.radiance), alpha, distance, normal, rays.far, rays.directions)
+    return to_rendering(spread(values.radiance), alpha, distance, normal, far, rays.directions)
 
 
 def _lowest(field: Field, rays: Rays, traced: TracedRays, ctx: Context) -> Float[Tensor, " n"]:

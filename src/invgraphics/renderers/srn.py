@@ -132,7 +132,7 @@ class SRN(RayRenderer):
 
     def render_rays(self, field: Field, rays: Rays, ctx: Context) -> tuple[Rendering, Trace]:
         """Render n rays; with normals, from the points of neighbouring rays, if ``ctx.geometry`` is set."""
-        rays = ctx.bounds.clip(rays)
+        far, rays = rays.far, ctx.bounds.clip(rays)
         hit = hit_indices(rays)
         seen = rays[hit]
         *_, last = self.march(field, seen, ctx)
@@ -148,7 +148,7 @@ class SRN(RayRenderer):
                 seen, last.detach(), lambda turned: self.distances(field, ctx.bounds.clip(turned), steady)
             )
             normal = torch.zeros_like(rays.directions).index_copy(0, hit, facing)
-        rendering = to_rendering(sums[:, :3], sums[:, 3], sums[:, 4], normal, rays.far, rays.directions)
+        rendering = to_rendering(sums[:, :3], sums[:, 3], sums[:, 4], normal, far, rays.directions)
         return rendering, Trace(samples, FieldValues(radiance=radiance), weight, rays=len(rays))
 
     @override

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
-from invgraphics.core.planes import homographies, warp
+from invgraphics.core.planes import homographies_to, warp
 from invgraphics.core.scene import Points, Scene, View
 from invgraphics.fields.plane_sweep import premultiplied
 
@@ -130,8 +130,7 @@ def _depth_map(pictures: Sequence[_Picture], index: int, others: Sequence[int]) 
         return torch.full_like(here.layers[0], torch.nan)
     costs = []
     for other in others:
-        # The third coordinate of the inverse is positive where that of the map is: before the other view.
-        maps = torch.linalg.inv(homographies(here.camera, here.planes, pictures[other].camera))
+        maps = homographies_to(here.camera, here.planes, pictures[other].camera)
         layers = pictures[other].layers.expand(PLANES, -1, -1, -1)
         seen, inside, _ = warp(layers, maps, (here.camera.width, here.camera.height))
         difference = torch.where(inside > 0, (seen - here.layers).abs().mean(dim=1), 1.0)
