@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 from torch import nn
 
 from invgraphics.core import Scene, harmonics
+from invgraphics.core.camera import pixel_limit
 from invgraphics.core.lattice import LatticeField
 from invgraphics.errors import InputError
 from invgraphics.fields.depth_maps import DepthMapsConfig, stored_bytes
@@ -30,6 +32,8 @@ SAMPLE_BYTES = 32
 """Of a sample: its ray, interval, position and density."""
 TRAINED_COPIES = 4
 """Of each parameter of a network: itself, its gradient and Adam's two moments."""
+KEPT_SHARE = 0.25
+"""Of a sparse lattice's vertices, how many pruning is expected to leave: surfaces keep fewer, and clouds of smoke more."""
 SAMPLES_REMEDY = "Choose a lower batches.rays or batches.samples, fewer samples in renderer.sampler, or a lower field.width."
 NETWORK_REMEDY = "Choose a smaller network: field.width, field.layers, or the size of field.encoding."
 
@@ -82,9 +86,10 @@ def _check_network(recipe: Recipe, name: str, scene: Scene, on_rays: int) -> Non
     check_fits(trained, f"A step of {name}, with gradients and moments,", NETWORK_REMEDY)
     activations = max(batches.samples or on_rays, batches.rays) * activation
     check_fits(trained + activations, f"A step of {name}, with what its network keeps for gradients,", SAMPLES_REMEDY)
-    finest = max((size for hook in recipe.hooks for size in _resolutions(hook)), default=0)
+    finest = _finest(recipe, scene)
     if grown := _resized(config, finest):
-        needed = _grown_bytes(_build(grown, name, scene))
+        parameters, links = _grown_bytes(_build(grown, name, scene), kept=0.0)
+        needed = TRAINED_COPIES * parameters + links
         what = f"The field of {name}, up-sampled to {finest:,} vertices along an edge,"
         check_fits(needed, what, "Choose a lower 'resolution' in the hooks.")
 
@@ -97,9 +102,24 @@ def _check_planes(config: PlanesConfig, name: str, scene: Scene) -> None:
     check_fits(texels * TEXEL_BYTES, what, "Choose a lower field.count or field.texels.")
 
 
-def _resolutions(hook: Any) -> tuple[int, ...]:
-    """Vertices along an edge to which a hook resizes lattices during the fit."""
-    return (getattr(hook, "resolution", 0), *getattr(hook, "resolutions", ()))
+def upsampled_bytes(method: Method, scene: Scene) -> int:
+    """Bytes of a field after the last up-sampling of its lattices, gradients and moments apart; 0 where none is up-sampled.
+
+    Sparse lattices are taken to keep `KEPT_SHARE` of their vertices.
+    """
+    grown = _resized(method.recipe.field, _finest(method.recipe, scene))
+    return sum(_grown_bytes(_build(grown, method.name, scene), KEPT_SHARE)) if grown else 0
+
+
+def _finest(recipe: Recipe, scene: Scene) -> int:
+    """Most vertices along an edge to which hooks resize lattices, within their limits by the pictures' pixels; 0 for none."""
+    sizes = [0]
+    for hook in recipe.hooks:
+        size = max(getattr(hook, "resolution", 0), *getattr(hook, "resolutions", ()), 0)
+        if size and (spacing := getattr(hook, "min_spacing", 0)):
+            size = min(size, math.ceil(pixel_limit(scene.bounds, [view.camera for view in scene.train]) / spacing))
+        sizes.append(size)
+    return max(sizes)
 
 
 def _resized(config: Any, resolution: int) -> Any:
@@ -129,12 +149,12 @@ def _bytes(field: nn.Module | None) -> int:
     return 0 if field is None else sum(parameter.numel() * parameter.element_size() for parameter in field.parameters())
 
 
-def _grown_bytes(field: nn.Module | None) -> int:
-    """Bytes of a field whose lattices have grown, with gradients and moments; of sparse ones the links, as rows are pruned."""
+def _grown_bytes(field: nn.Module | None, kept: float) -> tuple[int, int]:
+    """Bytes of parameters and of links of a field of lattices, whose sparse ones keep a share of their rows."""
     if not isinstance(field, LatticeField):
-        return 0
+        return 0, 0
     lattices = [lattice for encoding in field.lattice_encodings().values() for lattice in encoding.lattices()]
     linked = [lattice for lattice in lattices if lattice.links is not None]
     links = sum(lattice.links.numel() * lattice.links.element_size() for lattice in linked if lattice.links is not None)
     rows = sum(lattice.features.numel() * lattice.features.element_size() for lattice in linked)
-    return TRAINED_COPIES * (_bytes(field) - rows) + links
+    return _bytes(field) - round((1 - kept) * rows), links

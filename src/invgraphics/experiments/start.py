@@ -12,7 +12,7 @@ from invgraphics import locks
 from invgraphics.core import Field, RayRenderer
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
-from invgraphics.experiments.memory_check import COPIES, RAY_BYTES
+from invgraphics.experiments.memory_check import COPIES, RAY_BYTES, TRAINED_COPIES, upsampled_bytes
 from invgraphics.experiments.progress import warn
 from invgraphics.fields.mesh import MeshFieldConfig
 from invgraphics.formats.mesh import mesh_from_file
@@ -120,8 +120,9 @@ class MemoryForecast:
 def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
     """Forecast peak memory: what a step and a monitor pass needed, plus what is still to be allocated.
 
-    To come are primitives with their gradients, moments and footprints, pictures at full size where the fit begins with smaller
-    ones, more rays where empty space leaves fewer samples on each, and a checkpoint's copy of the parameters and their moments.
+    To come are primitives with their gradients, moments and footprints, lattices that are up-sampled, pictures at full size where
+    the fit begins with smaller ones, more rays where empty space leaves fewer samples on each, and a checkpoint's copy of the
+    parameters and their moments.
     Empty space is not known yet, so that rays are as full of samples as they will ever be.
 
     Args:
@@ -135,21 +136,28 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
     field = plan.model.field
     now = field.primitive_count() or 0
     most = max(now, *(int(getattr(hook, "max_primitives", 0)) for hook in method.recipe.hooks), 0) if now else 0
-    row = sum(parameter[0].numel() * parameter.element_size() for parameter in field.parameters()) if now else 0
+    row = _row_bytes(field, now) if now else 0
     needed = most * (COPIES * row + SCREEN_BYTES)
     has = _machine_bytes(next(field.parameters()).device) if now else needed
     if needed > has:
         sentence = f"{most:,} primitives need about {needed / 1e9:.1f} GB of memory, and this machine has {has / 1e9:.1f} GB."
         raise InputError(sentence, "Choose a lower --max-primitives.")
     growth = (most - now) * (COPIES * row + SCREEN_BYTES)
+    lattices = max(0, upsampled_bytes(method, plan.scene) - model_bytes([field])) * (TRAINED_COPIES + CHECKPOINT_COPIES)
     parameters = model_bytes(plan.modules.values()) + (most - now) * row
     on_rays = isinstance(plan.model.renderer, RayRenderer)
     sizes = [size_of(view) for view in plan.scene.train]
     starts_small = any(plan.batches.scale_at(0.0, max(size)) < 1 for size in sizes)
     pictures = max(width * height for width, height in sizes) * PICTURE_BYTES if starts_small and not on_rays else 0
     rays = Batches.MAX_RAYS * RAY_BYTES if on_rays and plan.batches.samples else 0
-    total = MARGIN * held + GROWTH_MARGIN * growth + pictures + rays + CHECKPOINT_COPIES * parameters + BASE_BYTES
+    total = MARGIN * held + GROWTH_MARGIN * growth + lattices + pictures + rays + CHECKPOINT_COPIES * parameters + BASE_BYTES
     return MemoryForecast(round(total), most)
+
+
+def _row_bytes(field: Field, primitives: int) -> int:
+    """Bytes of one primitive: of the tensors with a row for each, not of networks that all of them share."""
+    tensors = [*field.parameters(), *field.buffers()]
+    return sum(one[0].numel() * one.element_size() for one in tensors if one.dim() and len(one) == primitives)
 
 
 def _machine_bytes(device: torch.device) -> int:
