@@ -433,3 +433,15 @@ def test_fits_are_scored_on_scenes_and_runs_opened_with_them() -> None:
     small = ig.load_scene("toy.npz", size=12)
     run = ig.load_run("run", small)
     assert run.scene is small and run.evaluate()["psnr"] == ig.evaluate(fit, small)["psnr"] != fit.scores["psnr"]
+
+
+def test_patterns_name_what_nothing_else_does_in_the_order_given(tmp_path: Path) -> None:
+    from invgraphics.api.comparing import _names
+
+    table = ig.load_method(SPLATS.name, set={"field.count": 7})
+    names, optional = _names(["planes/mpi", "planes/mp*"], tmp_path)
+    assert (names, optional) == (("planes/mpi",), frozenset())
+    names, optional = _names([table, "planes/*", "planes/mpi", "planes/mp*"], tmp_path)
+    assert names[0].startswith(SPLATS.name) or names[0].startswith(str(tmp_path))
+    assert names[-1] == "planes/mpi" and len(set(names)) == len(names)
+    assert optional == set(names[1:-1]) and "planes/nex" in optional

@@ -28,7 +28,7 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.runs.checkpoint import load, save
-from invgraphics.runs.folder import CHECKPOINT
+from invgraphics.runs.folder import CHECKPOINT, RunFolder
 from invgraphics.runs.schema import plain
 from invgraphics.scenes.open import SceneOptions, open_scene
 
@@ -261,6 +261,26 @@ def test_existing_runs_are_not_overwritten(run: Path, toy_folder: Path) -> None:
     stamp = (run / "scores.json").stat().st_mtime_ns
     fit_run(_request(toy_folder, run, existing="reuse"))
     assert (run / "scores.json").stat().st_mtime_ns == stamp
+
+
+def test_a_renamed_method_is_named(run: Path, toy_folder: Path) -> None:
+    """The same recipe, with a setting in the method's name rather than beside it, has another identity."""
+    first, *rest = SMALL[METHOD]
+    with pytest.raises(InputError, match=f"a run called '{METHOD}', not '{METHOD}:{first}'"):
+        fit_run(_request(toy_folder, run, method=f"{METHOD}:{first}", overrides=tuple(rest), existing="resume"))
+
+
+def test_snapshots_of_a_lost_end_are_removed(toy_folder: Path, tmp_path: Path) -> None:
+    """A fit killed after its last checkpoint has written snapshots of steps that the resumed fit takes anew."""
+    folder = RunFolder(fit_run(_request(toy_folder, tmp_path / "run", snapshots=2)))
+    kept = {path: path.read_bytes() for path in folder.snapshots}
+    assert len(kept) == 3
+    lost, broken = folder.snapshot(7), folder.snapshot(8)
+    save(lost, load(folder.snapshots[-1]) | {"fit": {"steps": torch.tensor(31)}})
+    broken.write_bytes(b"broken")
+    (folder.root / "scores.json").unlink()
+    fit_run(_request(toy_folder, folder.root, snapshots=2, existing="resume"))
+    assert {path: path.read_bytes() for path in folder.snapshots} == kept
 
 
 def test_a_resumed_fit_keeps_its_peak_memory(run: Path, toy_folder: Path, tmp_path: Path) -> None:

@@ -117,6 +117,15 @@ def test_what_is_no_table_is_refused_in_words(tmp_path: Path, text: str) -> None
         RunFolder(tmp_path).read_scores()
 
 
+def test_what_a_record_itself_refuses_is_named(tmp_path: Path) -> None:
+    """A prediction without bounds, in the depths of a study's record."""
+    table = example(StudyRecord).to_table()
+    table["predictions"][1] |= {"low": None, "high": None}
+    (tmp_path / "study.json").write_text(json.dumps(table))
+    with pytest.raises(InputError, match=r"study\.json', key 'predictions\.1': A prediction needs 'low', 'high' or both"):
+        StudyRecord.read(tmp_path / "study.json")
+
+
 def test_numbers_that_json_cannot_hold(tmp_path: Path) -> None:
     """NaN counts as missing, infinity (the PSNR of equal pictures) stays; neither is ever written."""
     table = {"method": "m", "views": [], "cost": {"dead": math.nan}, "quality": {}}
@@ -148,6 +157,9 @@ def test_locations_of_schema_1_had_rounds_among_their_keys(tmp_path: Path) -> No
     table["starts"] = [{"start": 3, "loss_at_start": 0.5, "loss_at_scale_0.25": 0.2, "loss_at_scale_1": 0.1}]
     (tmp_path / "x.json").write_text(json.dumps(table))
     assert Location.read(tmp_path / "x.json").starts[0].rounds == {"0.25": 0.2, "1": 0.1}
+    (tmp_path / "x.json").write_text(json.dumps(table | {"starts": [1]}))
+    with pytest.raises(InputError, match=r"'starts\.0' cannot be 1"):
+        Location.read(tmp_path / "x.json")
 
 
 @pytest.mark.parametrize(

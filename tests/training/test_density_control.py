@@ -322,6 +322,17 @@ def test_resets_that_come_too_soon_are_left_out() -> None:
     assert lowered == [False, True, False, False]
 
 
+def test_no_reset_where_density_control_is_off() -> None:
+    """``stop = 0`` leaves the Gaussians as they are: opacities too, scheduled or at the start against white."""
+    state = _state(3)
+    state.scene = replace(state.scene, background=torch.ones(3))
+    hook = DensityControlConfig(stop=0, every=10, start=0.1, resets=(0.2,), white_reset=True).build()
+    for step, progress in ((700, 0.15), (900, 0.25), (901, 0.26)):
+        state.step, state.ctx = step, replace(state.ctx, progress=progress)
+        _end_step(state, hook)
+    assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)
+
+
 def test_large_gaussians_stay_until_a_reset_has_happened() -> None:
     """One that is due but left out says nothing about how long the Gaussians have had to shrink."""
     state = _state(3)

@@ -201,6 +201,17 @@ def test_a_hook_restarts_rates_and_drops_all_moments(scene):
         assert fit._optimiser.rate_of("field.encoding.levels.0") == pytest.approx(0.05)
 
 
+def test_a_larger_budget_stretches_the_restarted_rates(scene):
+    """At 8 of 40 steps, restarted at 4 (progress 0.1): a ninth of the rest is over, and no rate is above its start."""
+    fit = fit_of(scene, "voxels", 8, at=[0.5], resolution=9, moments="drop", restart_rates=True)
+    fit.run(lambda loss: False)
+    fit.set_budget(Budget(steps=40))
+    fit.step()
+    config = method_with("voxels").recipe.optimiser.groups
+    for key, rate in fit._optimiser.rates().items():
+        assert rate == pytest.approx(config[key].rate(1 / 9)), key
+
+
 def equal(a, b):
     return a.keys() == b.keys() and all(
         a[part].keys() == b[part].keys() and all(torch.equal(a[part][name], b[part][name]) for name in a[part]) for part in a

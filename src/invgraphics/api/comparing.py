@@ -156,8 +156,14 @@ def compare(
 
 
 def _names(methods: Sequence[MethodLike] | MethodLike, folder: Path) -> tuple[tuple[str, ...], frozenset[str]]:
-    """Names of methods for other processes, those that patterns name among them, and which of them only a pattern names."""
+    """Names of methods for other processes, in order, patterns replaced by what only they name, and which those are."""
     given = listed(methods, (str, os.PathLike, Mapping, Method))
-    expanded, optional = expand([method for method in given if isinstance(method, str)])
-    others = [method for method in given if not isinstance(method, str)]
-    return tuple(name_of(method, folder / "methods") for method in ([*expanded, *others] if optional else given)), optional
+    _, optional = expand([method for method in given if isinstance(method, str)])
+    names: list[str] = []
+    for method in given:
+        matching, by_pattern = expand([method]) if isinstance(method, str) else ((), ())
+        if by_pattern:
+            names += [name for name in matching if name in optional and name not in names]
+        else:
+            names.append(name_of(method, folder / "methods"))
+    return tuple(names), optional

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from invgraphics.core import Camera, Conditional, Context, RayRenderer, Rays, Scene, View
 from invgraphics.core.finite import describe_non_finite
-from invgraphics.errors import NumericalError
+from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.clocks import fit_record
 from invgraphics.experiments.posed import transform_camera, world_to_fit
 from invgraphics.experiments.progress import Reporter
@@ -222,3 +222,14 @@ class Recorder:
         if self._folder is not None:
             self._folder.append_history(moment)
         return psnr
+
+
+def cut_snapshots(folder: RunFolder, step: int) -> None:
+    """Remove snapshots of later steps than ``step``, from which a resumed fit continues and writes its own; unreadable ones too."""
+    for path in folder.snapshots:
+        try:
+            kept = int(checkpoint.load(path)["fit"]["steps"]) <= step
+        except (InputError, KeyError):
+            kept = False
+        if not kept:
+            path.unlink(missing_ok=True)

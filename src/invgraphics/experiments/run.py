@@ -29,7 +29,7 @@ from invgraphics.experiments.identity import check_existing, run_digest, truth_d
 from invgraphics.experiments.job import Job, make_training_scene, region_of
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
-from invgraphics.experiments.recorder import Monitor, Recorder
+from invgraphics.experiments.recorder import Monitor, Recorder, cut_snapshots
 from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, check_losses, initialise_field, memory_forecast, remove_empty
@@ -98,9 +98,13 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         identity = run_digest(job, truth_digest(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
+            named = folder.read(Provenance).method if folder.has(Provenance) else method.name
+            renamed, other = (
+                f"called '{named}', not '{method.name}'",
+                "of other code, threads, kernels or pictures of the same scene",
+            )
             raise InputError(
-                f"{folder.root} holds a run of other code, threads, kernels or pictures of the same scene.",
-                "Choose another --out.",
+                f"{folder.root} holds a run {renamed if named != method.name else other}.", "Choose another --out."
             )
         if same and folder.finished:
             for protocol in job.unscored():
@@ -117,6 +121,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
             if earlier is not None:
                 memory.include(earlier.peak_memory_bytes or 0)
                 folder.cut_history(fit.steps)
+                cut_snapshots(folder, fit.steps)
             else:
                 folder.clear()
             before = folder.read(Environment) if earlier is not None and folder.has(Environment) else None

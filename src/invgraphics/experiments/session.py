@@ -170,7 +170,7 @@ class MemoryRun(FittedRun):
             InputError: the budget cannot be read.
         """
         if budget is not None:
-            self.fit.plan = replace(self.fit.plan, budget=Budget.parse(budget))
+            self.fit.set_budget(Budget.parse(budget))
         self._run()
 
     @property

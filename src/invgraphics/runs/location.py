@@ -73,7 +73,7 @@ class Location(Record):
     def migrate(cls, table: dict[str, Any], schema: int) -> dict[str, Any]:
         """Convert schema 1, which had ``loss_at_scale_S`` in place of the entry ``S`` of ``rounds``."""
         starts = table.get("starts")
-        if not isinstance(starts, list):
+        if not isinstance(starts, list) or not all(isinstance(one, dict) for one in starts):
             return table
         mark = "loss_at_scale_"
         rounds = [{key.removeprefix(mark): one[key] for key in one if key.startswith(mark)} for one in starts]

@@ -104,7 +104,8 @@ def from_table(kind: type[T], table: Any, source: Path, key: str = "") -> T:
         key: dotted path of the table in the file; empty for the whole file.
 
     Raises:
-        InputError: a key is missing, a value has the wrong type, or the schema is newer; the sentence names file and key.
+        InputError: a key is missing, a value has the wrong type or is refused by ``kind``, or the schema is newer; the sentence
+            names file and key.
     """
     if not isinstance(table, Mapping):
         raise _wrong(source, key, table, "a table")
@@ -119,7 +120,11 @@ def from_table(kind: type[T], table: Any, source: Path, key: str = "") -> T:
             raise InputError(f"'{source}' lacks the key '{path}'.", f"Expected: {_described(hints[field.name])}.")
         if not optional or table.get(field.name) is not None:
             values[field.name] = _converted(hints[field.name], table[field.name], source, path)
-    return kind(**values)
+    try:
+        return kind(**values)
+    except ValueError as error:  # a record's own check of its values
+        where = f"'{source}', key '{key}'" if key else f"'{source}'"
+        raise InputError(f"{where}: {error}") from error
 
 
 def read_table(path: Path) -> dict[str, Any]:

@@ -179,7 +179,7 @@ class DensityControl(Hook):
             self._grow_and_prune(state)
         if self._resets_due < len(config.resets) and progress >= config.resets[self._resets_due]:
             self._resets_due += 1
-            if state.step + 1 - self._last_reset >= config.reset_spacing:
+            if config.stop > 0 and state.step + 1 - self._last_reset >= config.reset_spacing:
                 self._last_reset, self._reset_pending = state.step + 1, True
         self._reset_pending |= starts and self._resets_at_start(state)
 
@@ -191,7 +191,7 @@ class DensityControl(Hook):
     def _resets_at_start(self, state: FitState) -> bool:
         """Whether opacities are reset as growth begins: against a white background, unless that is too early to recover."""
         soonest = min(self._config.reset_spacing, WHITE_RESET_STEP)
-        white = self._config.white_reset and bool((state.scene.background >= 1).all())
+        white = self._config.white_reset and self._config.stop > 0 and bool((state.scene.background >= 1).all())
         return white and state.step + 1 >= soonest
 
     @torch.no_grad()

@@ -235,7 +235,7 @@ class ScaleLoss:
 
 
 def normalised_distance(t: Float[Tensor, "*n"], bounds: Bounds) -> Float[Tensor, "*n"]:
-    """Distance along a ray in the spacing of the samplers' strata, in units of the longest interval that a ray can have.
+    """Distance along a ray in the spacing of `to_spacing`, in units of the longest interval that a ray can have.
 
     In a box that is distance over the box's diagonal. In a contracted space it is mip-NeRF 360's s (equation 11) with
     nerfacto's spacing: distance up to the bounds' radius and disparity beyond, each over half of [0, 1]. One scale serves all

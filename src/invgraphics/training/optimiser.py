@@ -157,6 +157,10 @@ class Optimiser:
         self._restart_progress = min(progress, LATEST_RESTART)
         self.set_progress(progress)
 
+    def move_restart(self, factor: float) -> None:
+        """Multiply the progress of the last `restart`, whose step is at another progress of another budget."""
+        self._restart_progress = min(self._restart_progress * factor, LATEST_RESTART)
+
     def rates(self) -> dict[str, float]:
         """Current learning rate of each group."""
         return {group["name"]: group["lr"] for group in self._groups()}
