@@ -1,6 +1,7 @@
 """Files that cannot be used get a sentence each, and a million Gaussians on one point are no problem."""
 
 import gzip
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -99,6 +100,11 @@ BAD: dict[str, tuple[str, Callable[[Path], bytes], str]] = {
     "gzip bomb": ("a.spz", lambda _: gzip.compress(LEGACY + bytes(50_000_000)), "continues after its Gaussians"),
     "gzip claim": ("a.spz", lambda _: gzip.compress(_claiming(LEGACY, 2_000_000_000) + bytes(1000)), "claims 2,000,000,000"),
     "zstd claim": ("a.spz", lambda _: _zstd_bomb(60_000_000), "claims 60,000,000 Gaussians"),
+    "count of 5000 digits": (
+        "a.ply",
+        lambda folder: re.sub(rb"element vertex \d+", b"element vertex " + b"9" * 5000, _ply(folder)),
+        "PLY header cannot be used",
+    ),
     "half a packed PLY": (
         "a.ply",
         lambda folder: _ply(folder).replace(b"float nx", b"float packed_color"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gaussian_files import cloud, worst_psnr
+from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 
 from invgraphics.errors import InputError
@@ -70,7 +71,7 @@ def _table(names: list[str], kind: str, n: int = 5) -> np.ndarray:
 @pytest.mark.parametrize(("kind", "order"), [("f4", "<"), ("f8", "<"), ("f4", ">")])
 def test_files_of_an_independent_writer(tmp_path: Path, kind: str, order: str) -> None:
     """Other properties in other places, double precision, big-endian, elements before and after, no normals."""
-    names = ["red", *(name for name in reversed(STANDARD) if name not in ("nx", "ny", "nz")), "filter_3D"]
+    names = ["red", *(name for name in reversed(STANDARD) if name not in ("nx", "ny", "nz")), "confidence"]
     table = _table(names, kind)
     other = np.array([(1, 2)], [("width", "i4"), ("height", "i4")])
     faces = np.array([([0, 1, 2],)], [("vertex_indices", "i4", (3,))])
@@ -81,6 +82,22 @@ def test_files_of_an_independent_writer(tmp_path: Path, kind: str, order: str) -
     assert torch.allclose(gaussians.opacities, 1 / (1 + torch.exp(-torch.from_numpy(table["opacity"].astype(np.float32)))))
     assert torch.allclose(gaussians.quaternions[:, 3], torch.from_numpy(table["rot_3"].astype(np.float32)))
     assert torch.allclose(gaussians.sh[:, 4, 1], torch.from_numpy(table["f_rest_18"].astype(np.float32)))
+
+
+def test_a_stored_3d_filter_is_applied(tmp_path: Path) -> None:
+    """As Mip-Splatting's training code writes them: a blurred Gaussian is wider, lower, and has the same integral."""
+    names = [name for name in STANDARD if not name.startswith("f_rest_")]
+    table = _table([*names, "filter_3D"], "f4")
+    PlyData([PlyElement.describe(repack_fields(table[names]), "vertex")]).write(tmp_path / "bare.ply")
+    table["filter_3D"] = np.array([0.0, 0.1, 0.5, 1.0, 3.0])
+    PlyData([PlyElement.describe(table, "vertex")]).write(tmp_path / "filtered.ply")
+    bare, filtered = (read_gaussians(tmp_path / f"{name}.ply")[1] for name in ("bare", "filtered"))
+    assert any("filter_3D" in note for note in filtered.notes) and not bare.notes
+    bare, filtered = bare.gaussians, filtered.gaussians
+    variance = bare.scales**2 + torch.from_numpy(table["filter_3D"].copy())[:, None] ** 2
+    torch.testing.assert_close(filtered.scales**2, variance)
+    mass, filtered_mass = (one.opacities * one.scales.prod(dim=1) for one in (bare, filtered))
+    torch.testing.assert_close(filtered_mass, mass)
 
 
 @pytest.mark.parametrize("flushed", [False, True])

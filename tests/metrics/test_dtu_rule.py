@@ -96,6 +96,10 @@ def test_files_beside_the_cameras(scan: Scan, tmp_path: Path) -> None:
     assert found.plane.tolist() == [0, 0, 1, 0]
     mesh = sphere(9.0)
     assert dtu_score(mesh, found).accuracy == pytest.approx(dtu_score(mesh, scan).accuracy, abs=1e-4)
+    for broken in ({"BB": box[:1]}, {"Res": 0.0}, {"Res": []}, {"ObsMask": np.ones(3)}, {"BB": "words"}):
+        savemat(tmp_path / "ObsMask24_10.mat", {"ObsMask": scan.observed.numpy(), "BB": box, "Res": 5.0} | broken)
+        with pytest.raises(InputError, match="ObsMask24_10"):
+            find_scan(tmp_path)
     (tmp_path / "ObsMask24_10.mat").write_bytes(b"nonsense")
     with pytest.raises(InputError, match="ObsMask24_10"):
         find_scan(tmp_path)

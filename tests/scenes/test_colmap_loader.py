@@ -72,6 +72,28 @@ def test_dots_are_where_the_cameras_say(tmp_path: Path, place: str) -> None:
     assert "RADIAL, SIMPLE_RADIAL" in scene.notes["undistortion"]
 
 
+def test_names_with_spaces_are_whole(tmp_path: Path) -> None:
+    """COLMAP's own reader of text cuts them off at the first space."""
+    mixed(tmp_path)
+    text = tmp_path / "sparse/0/images.txt"
+    content = text.read_text()
+    for name, spaced in (("00.png", "IMG 0 a.png"), ("01.png", "IMG 0 b.png"), ("08.png", "IMG 8.png")):
+        content = content.replace(name, spaced)
+        (tmp_path / "images" / name).rename(tmp_path / "images" / spaced)
+    text.write_text(content)
+    scene = validate(Colmap().load(tmp_path, SceneOptions()))
+    names = {view.name for view in (*scene.train, *scene.test)}
+    assert names == {"IMG 0 a.png", "IMG 0 b.png", "IMG 8.png", *(f"{index:02}.png" for index in range(2, 8))}
+    assert_dots_are_found(scene)
+
+
+def test_a_camera_without_a_focal_length_is_refused(tmp_path: Path) -> None:
+    """Asked for its focal length, pycolmap would end the process."""
+    write(tmp_path, ring(2), ["EQUIRECTANGULAR 160 120 160 120"] * 2)
+    with pytest.raises(InputError, match="EQUIRECTANGULAR .* cannot be made a pinhole"):
+        Colmap().load(tmp_path, SceneOptions())
+
+
 def test_two_photographs_are_a_scene(tmp_path: Path) -> None:
     """Opposite cameras on an axis: one of their coordinates differs by rounding only."""
     eye = ring(1)[0]

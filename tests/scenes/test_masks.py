@@ -15,7 +15,7 @@ from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.nerfstudio import Nerfstudio
 from invgraphics.scenes.open import validate
 from invgraphics.scenes.pictures.images import Photo
-from invgraphics.scenes.pictures.masks import with_masks_beside
+from invgraphics.scenes.pictures.masks import read_mask, with_masks_beside
 
 
 @pytest.fixture
@@ -72,6 +72,19 @@ def test_masks_of_other_sizes_and_values_are_read(folder: Path) -> None:
     mask = load(folder).train[0].mask
     assert mask is not None
     assert torch.equal(mask.all(dim=0), torch.arange(160) >= 40)
+
+
+def test_a_larger_mask_masks_all_that_it_touches(tmp_path: Path) -> None:
+    """Masks at full size beside photographs at a quarter of it; a smaller mask gives its nearest pixel."""
+    fine = np.full((16, 16), 255, np.uint8)
+    fine[:, 1:4] = 0
+    fine[:, 8] = 0
+    save(fine, tmp_path / "fine.png")
+    assert (read_mask(tmp_path / "fine.png", 4, 4)[0, :, 0] == 255).tolist() == [False, True, False, True]
+    coarse = np.full((2, 3), 255, np.uint8)
+    coarse[:, 1] = 0
+    save(coarse, tmp_path / "coarse.png")
+    assert (read_mask(tmp_path / "coarse.png", 5, 3)[0, :, 0] == 255).tolist() == [True, True, False, True, True]
 
 
 def test_colmap_s_names_of_masks(tmp_path: Path) -> None:

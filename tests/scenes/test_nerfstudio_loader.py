@@ -16,6 +16,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.nerfstudio import Nerfstudio
 from invgraphics.scenes.open import validate
+from invgraphics.scenes.ply_points import read_points
 
 K1, K2, P1, P2, K3 = 0.6, -0.3, 0.01, -0.008, 0.2
 
@@ -122,6 +123,19 @@ def point_file(kind: str) -> bytes:
         for point, c in zip(POINTS, COLOURS, strict=True)
     ]
     return head.encode() + b"".join(rows) + struct.pack(f"{order}dddfBBB", np.nan, 0, 0, 0, 1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "white"), [("uchar", 255), ("ushort", 65535), ("ushort", 255), ("int", 255), ("float", 1), ("double", 255)]
+)
+def test_colours_of_points_in_every_type(tmp_path: Path, kind: str, white: int) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {name}\n" for name in "xyz")
+    head += "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
+    rows = [f"0 0 0 {white} {0.2 * white:.{0 if white > 1 else 1}f} 0", "1 0 0 0 0 0"]
+    (tmp_path / "a.ply").write_text(head + "\n".join(rows) + "\n")
+    points = read_points(tmp_path / "a.ply")
+    assert points is not None
+    assert points.rgb[0].tolist() == pytest.approx([1.0, 0.2, 0.0])
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])

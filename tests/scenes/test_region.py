@@ -33,6 +33,15 @@ def test_box_holds_the_subject_but_not_its_surroundings() -> None:
     assert subject_half(points[:3]) == 1.0
 
 
+def test_dense_scans_have_a_frame_too() -> None:
+    """More points than torch's quantile takes, 2^24."""
+    points = torch.randn(2**24 + 1, 3)
+    assert subject_half(0.1 * points) == pytest.approx(
+        MARGIN * 0.1 * math.sqrt(4.108), rel=1e-3
+    )  # chi-squared of 3, quantile 3/4
+    assert near_plane(ring(9.0, 1).float(), 1e-3 * points) == pytest.approx(CLEARANCE * 9.0, rel=1e-3)
+
+
 def test_near_plane_is_half_way_to_the_nearest_points() -> None:
     points = torch.cat([ball(0.2, 4000), torch.tensor([[2.99, 0.0, 0.0]], dtype=F64)])
     near = near_plane(ring(3.0), points)

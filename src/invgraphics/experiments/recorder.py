@@ -225,7 +225,7 @@ class Recorder:
 
 
 def cut_snapshots(folder: RunFolder, step: int) -> None:
-    """Remove snapshots of later steps than ``step``, from which a resumed fit continues and writes its own; unreadable ones too."""
+    """Remove snapshots of steps after ``step``, from which a resumed fit continues and writes its own; unreadable ones too."""
     for path in folder.snapshots:
         try:
             kept = int(checkpoint.load(path)["fit"]["steps"]) <= step

@@ -20,6 +20,8 @@ POSITION, NORMAL, DC, OPACITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", 
 SCALE, ROTATION = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 NEEDED = (*POSITION, *DC, *OPACITY, *SCALE, *ROTATION)
 """Properties without which there are no Gaussians; normals are written as zeros and ignored."""
+FILTER = ("filter_3D",)
+"""Standard deviation of a 3D smoothing filter that scales and opacities are stored without (Yu et al. 2024, Mip-Splatting)."""
 
 OPACITY_EPS = 1e-7
 """Opacities are kept this far from 0 and 1, whose logits are infinite."""
@@ -41,6 +43,8 @@ class Ply:
     def read(self, path: Path) -> Splats:
         """Read a file of any SH degree up to 3; other properties and elements are ignored.
 
+        A `FILTER` is applied: scales are widened by it, and opacities lowered so that the integral stays (Mip-Splatting, §4.1).
+
         Raises:
             InputError: it is no PLY file, is cut off, or lacks properties.
         """
@@ -53,14 +57,19 @@ class Ply:
                 "Expected x y z f_dc_0..2 opacity scale_0..2 rot_0..3, as 3DGS writes them.",
             )
         rest = rest_names(path, table.dtype.names or ())
+        scales, opacities, notes = columns(table, SCALE).exp(), columns(table, OPACITY)[:, 0].sigmoid(), comments
+        if not missing(table, FILTER):
+            wide = torch.hypot(scales, columns(table, FILTER))
+            scales, opacities = wide, opacities * (scales / wide.clamp_min(SMALLEST_SCALE)).prod(dim=1)
+            notes = (*notes, "Its 3D smoothing filter (filter_3D) was applied.")
         gaussians = Gaussians(
             means=columns(table, POSITION),
             quaternions=columns(table, ROTATION),
-            scales=columns(table, SCALE).exp(),
-            opacities=columns(table, OPACITY)[:, 0].sigmoid(),
+            scales=scales,
+            opacities=opacities,
             sh=coefficients(columns(table, DC), columns(table, rest) if rest else None),
         )
-        return Splats(gaussians, antialiased=True if any(ANTIALIASED in note for note in comments) else None, notes=comments)
+        return Splats(gaussians, antialiased=True if any(ANTIALIASED in note for note in comments) else None, notes=notes)
 
     def write(self, path: Path, splats: Splats) -> None:
         """Write the standard properties in the standard order, 62 floats at degree 3; notes become comments."""

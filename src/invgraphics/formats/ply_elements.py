@@ -26,6 +26,7 @@ _TYPES = {
 }
 _ENDIANNESS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"end_header\r?\n")
+_DIGITS = 18  # of a count that fits into 64 bits
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def read_header(path: Path, head: bytes) -> Header:
                 order = _ENDIANNESS[kind]
             case ["comment" | "obj_info", *_]:
                 comments.append(line.partition(" ")[2])
-            case ["element", name, count] if count.isdecimal() and name not in elements:
+            case ["element", name, count] if count.isdecimal() and len(count) <= _DIGITS and name not in elements:
                 if not listed:
                     elements[name] = int(count), []
             case ["property", "list", *_] if elements or listed:

@@ -21,6 +21,8 @@ _RIG, _SENSOR, _POSE = struct.Struct("<II"), struct.Struct("<iI"), struct.Struct
 _FLAG = struct.Struct("<B")
 _FRAME = struct.Struct("<II7dI")  # id, rig, pose, count of data (sensor and 64-bit id)
 _DATUM = _SENSOR.size + 8
+_BEFORE_NAME = 9  # words of an image's line in text: number, rotation, translation, camera
+_DIGITS = 10  # of an image's number
 
 
 class _TooShortError(Exception):
@@ -130,14 +132,17 @@ def _parameter_counts() -> dict[int, int]:
     return {int(model): len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params) for model in models}
 
 
-def check_images_text(path: Path) -> None:
-    """Check that each image of an ``images.txt`` has its second line, of points: COLMAP takes every second line for one.
+def names_in_text(path: Path) -> dict[int, str]:
+    """Names of an ``images.txt``'s images by their numbers, with the spaces at which COLMAP cuts them; none beside a binary.
+
+    Each image has a second line, of points: COLMAP takes every second line for one.
 
     Raises:
         InputError: a line of points is that of another image.
     """
     if not path.is_file() or path.with_suffix(".bin").is_file():
-        return
+        return {}
+    names: dict[int, str] = {}
     lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
     for line in lines:
         if not line.strip() or line.strip().startswith("#"):
@@ -146,6 +151,10 @@ def check_images_text(path: Path) -> None:
         if not _is_number(last[0]):
             sentence = f"{path} has no line of points after each image: '{last[0]}' follows another image at once."
             raise InputError(sentence, "Add an empty line after each image, as COLMAP writes it.")
+        match line.split(maxsplit=_BEFORE_NAME):
+            case [number, *rest] if number.isdecimal() and len(number) <= _DIGITS and len(rest) == _BEFORE_NAME:
+                names[int(number)] = rest[-1].rstrip()
+    return names
 
 
 def _is_number(text: str) -> bool:

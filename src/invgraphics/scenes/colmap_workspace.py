@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.colmap_sizes import check_images_text, check_sizes
+from invgraphics.scenes.colmap_sizes import check_sizes, names_in_text
 from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
 from invgraphics.scenes.pictures.images import file_exists
 
@@ -114,11 +114,13 @@ def _read(folder: Path, given: Path) -> Model:
     from invgraphics.scenes.colmap_library import pycolmap
 
     check_sizes(folder)
-    check_images_text(folder / "images.txt")
+    names_of = names_in_text(folder / "images.txt")
     try:
         reconstruction = pycolmap.Reconstruction(str(folder))
     except (ValueError, IndexError, RuntimeError, MemoryError) as error:
         raise InputError(f"The COLMAP model {folder} cannot be read: {str(error).splitlines()[0]}.") from error
+    for number, image in reconstruction.images.items():
+        image.name = names_of.get(number, image.name)
     bare = Model(folder, reconstruction, None, 0)
     try:
         names = [image.name for image in bare.registered]

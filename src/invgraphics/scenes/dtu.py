@@ -35,13 +35,31 @@ def find_scan(folder: Path) -> tuple[Scan | None, str]:
     values: dict[str, Any] = {"points": _points(scans[0])}
     if mask is not None:
         table = _matlab(mask, ("ObsMask", "BB", "Res"))
-        values["observed"] = torch.from_numpy(np.asarray(table["ObsMask"]) > 0)
-        values["origin"] = torch.from_numpy(np.asarray(table["BB"], np.float64).reshape(2, 3)[0].copy())
-        values["voxel"] = float(np.asarray(table["Res"]).reshape(-1)[0])
+        observed, box, voxel = np.asarray(table["ObsMask"]), _numbers(mask, table, "BB"), _numbers(mask, table, "Res")
+        if observed.ndim != 3 or observed.dtype.kind not in "biuf" or box.size != 6 or voxel.size != 1 or not voxel.min() > 0:
+            shapes = f"ObsMask {observed.shape}, BB {box.shape} and Res {voxel.tolist()}"
+            raise InputError(f"'{mask}' has {shapes}.", "Expected: a grid, 2 corners of 3 coordinates, and a size above 0.")
+        values["observed"] = torch.from_numpy(observed > 0)
+        values["origin"] = torch.from_numpy(box.reshape(2, 3)[0].copy())
+        values["voxel"] = float(voxel.reshape(()))
     if plane is not None:
-        values["plane"] = torch.from_numpy(np.asarray(_matlab(plane, ("P",))["P"], np.float64).reshape(-1)[:4].copy())
+        numbers = _numbers(plane, _matlab(plane, ("P",)), "P")
+        if numbers.size != 4:
+            raise InputError(f"'{plane}' has {numbers.size} numbers as its plane P.", "Expected: 4.")
+        values["plane"] = torch.from_numpy(numbers.reshape(4).copy())
     lacking = [name for name, path in (("observation mask", mask), ("table plane", plane)) if path is None]
     return Scan(**values), "".join(f"; the data has no {name}" for name in lacking)
+
+
+def _numbers(path: Path, table: dict[str, Any], name: str) -> np.ndarray:
+    """An array of a MATLAB file as finite float64."""
+    try:
+        values = np.asarray(table[name], np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"'{path}': {name} is no array of numbers.") from error
+    if not np.isfinite(values).all():
+        raise InputError(f"'{path}': {name} has values that are not finite.")
+    return values
 
 
 def _of_scene(folder: Path, pattern: str, number: int) -> Path | None:

@@ -26,12 +26,15 @@ _END = re.compile(rb"end_header\r?\n")
 _COLOURS = ("red", "green", "blue")
 _DIGITS = 18  # of a count that fits into 64 bits
 _GREY = 0.5  # of points without colours
+BRIGHT = 2.0
+"""Brightest colour of floats from 0 to 1: some overshoot white."""
 
 
 def read_points(path: Path) -> Points | None:
     """Read the vertices of a PLY file and their colours; ``None`` where there are none.
 
-    Colours are bytes, or floats from 0 to 1; without any, points are grey. Points that are not finite are left out.
+    Colours are whole numbers up to 255, or up to 65535 where one exceeds that, or floats up to 1, or up to 255 where one exceeds
+    `BRIGHT`; without any, points are grey. Points that are not finite are left out.
 
     Raises:
         InputError: it cannot be read, is no such file, or is cut off.
@@ -52,12 +55,19 @@ def read_points(path: Path) -> Points | None:
     position = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
     rgb = np.full(position.shape, _GREY, np.float32)
     if all(name in (record.names or ()) for name in _COLOURS):
-        largest = 255 if record["red"].kind in "iu" else 1
-        rgb = np.stack([table[name].astype(np.float32) for name in _COLOURS], axis=1) / largest
+        rgb = np.stack([table[name].astype(np.float32) for name in _COLOURS], axis=1)
+        rgb /= _white(float(rgb[np.isfinite(rgb)].max(initial=0)), whole=record["red"].kind in "iu")
     whole = np.isfinite(position).all(axis=1) & np.isfinite(rgb).all(axis=1)
     if not whole.any():
         return None
     return Points(torch.from_numpy(position[whole]), torch.from_numpy(rgb[whole].clip(0, 1)))
+
+
+def _white(highest: float, *, whole: bool) -> int:
+    """Value that stands for 1 among colours of which one has the value ``highest``."""
+    if whole:
+        return 255 if highest <= 255 else 65535
+    return 1 if highest <= BRIGHT else 255
 
 
 def _vertices(path: Path, header: str) -> tuple[str, int, np.dtype]:

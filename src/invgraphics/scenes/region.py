@@ -122,7 +122,7 @@ def subject_half(points: Float[Tensor, "n 3"]) -> float:
     """
     if len(points) < FEWEST:
         return 1.0
-    radius = float(points.norm(dim=1).double().quantile(SUBJECT_SHARE))
+    radius = float(np.quantile(points.norm(dim=1).double().numpy(), SUBJECT_SHARE))  # torch's takes no more than 2^24 values
     return min(max(MARGIN * radius, SMALLEST), 1.0)
 
 
@@ -139,7 +139,7 @@ def near_plane(poses: Float[Tensor, "k 4 4"], points: Float[Tensor, "n 3"]) -> f
         distance = offset.norm(dim=1)
         ahead = distance[offset @ pose[:3, 2] > math.cos(math.radians(VIEW_ANGLE)) * distance]
         if len(ahead) >= FEWEST:
-            nearest.append(float(torch.quantile(ahead, NEAREST_SHARE)))
+            nearest.append(float(np.quantile(ahead.numpy(), NEAREST_SHARE)))
     return CLEARANCE * min(nearest) if nearest else None
 
 

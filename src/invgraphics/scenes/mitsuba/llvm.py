@@ -76,8 +76,13 @@ def _candidates() -> Iterator[str]:
 
 
 def _version(path: Path) -> int:
-    """Major version in a library's name (``libLLVM.so.19.1``, ``libLLVM-19.so``); 0 where there is none."""
-    match = re.fullmatch(r"libLLVM(?:-(\d+)[\d.]*\.so.*|\.so\.(\d+).*|\.dylib)", path.name)
+    """Major version in a library's name: ``libLLVM.so.19.1``, ``libLLVM-19.so``, ``libLLVM.19.1.dylib``; 0 where there is none.
+
+    ``libLLVM.dylib``, as Homebrew's newest is called, counts as the oldest that is tried: the probe decides.
+    """
+    if path.name == "libLLVM.dylib":
+        return OLDEST
+    match = re.fullmatch(r"libLLVM(?:-(\d+)[\d.]*\.(?:so.*|dylib)|\.so\.(\d+).*|\.(\d+)[\d.]*\.dylib)", path.name)
     return int(next(filter(None, match.groups()), 0)) if match else 0
 
 

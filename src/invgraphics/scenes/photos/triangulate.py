@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -65,12 +66,13 @@ class Triangulated:
 
 
 def triangulated(scene: Scene) -> Triangulated:
-    """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on nothing else.
+    """SfM points of a scene's training photographs, from the cache or by `triangulate`; they depend on these and on pycolmap.
 
     A triangulation of many photographs is announced on stderr. Of several processes that need the same one, one makes it.
     Where the cache cannot be written, stderr says so and the points are returned all the same; a damaged file is replaced.
     """
-    sha = hashlib.sha256(f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour}".encode())
+    known = f"{SCHEMA} {scene.digest('train')} {scene.background.tolist()} {scene.colour} {version('pycolmap')}"
+    sha = hashlib.sha256(known.encode())
     for view in scene.train:
         for values in (view.camera.cam_to_world, view.camera.focal, view.camera.principal_point):
             sha.update(values.detach().cpu().double().numpy().tobytes())

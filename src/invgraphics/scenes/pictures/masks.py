@@ -12,9 +12,12 @@ from jaxtyping import Bool, UInt8
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.pictures.images import Photo, file_exists, image_size, read_pixels, turn_like
+from invgraphics.scenes.pictures.resize import area_resize
 
 FOLDER = "masks"
 """Where masks lie beside a folder of photographs."""
+WHOLE = 1 - 1e-6
+"""Valid share of what a pixel covers from which on it is valid: all of it, up to rounding."""
 
 
 def with_masks_beside(photos: Sequence[Photo], images: Path) -> list[Photo]:
@@ -50,7 +53,8 @@ def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]
     """Read a mask as a picture of a size: 255 where pixels are valid, which is where it is brighter than half of its maximum.
 
     Args:
-        mask: the file; where its size is not the photograph's, its nearest pixels are taken.
+        mask: the file; of a larger one than the photograph all pixels that a photograph's covers must be valid, of a smaller
+            one the nearest is taken.
         width: of the photograph in pixels.
         height: of the photograph.
 
@@ -64,8 +68,14 @@ def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]
     if not values.any():
         raise InputError(f"{mask} is black: no pixel of its photograph counts.", "Leave the photograph out, or its mask.")
     bright = values > values.max() // 2
-    rows, columns = ((np.arange(count) * stored) // count for count, stored in ((height, high), (width, wide)))
-    return np.repeat(np.where(bright, np.uint8(255), np.uint8(0))[rows][:, columns, None], 3, axis=2)
+    if wide >= width and high >= height:
+        valid = area_resize(bright[..., None].astype(np.float64), width, height)[..., 0] > WHOLE
+    else:
+        rows, columns = (
+            (2 * np.arange(count) + 1) * stored // (2 * count) for count, stored in ((height, high), (width, wide))
+        )
+        valid = bright[rows][:, columns]
+    return np.repeat(np.where(valid, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
 
 
 def read_upright_mask(mask: Path, photograph: Path, width: int, height: int) -> Bool[np.ndarray, "h w"]:
