@@ -90,7 +90,7 @@ def test_names_with_spaces_are_whole(tmp_path: Path) -> None:
 def test_a_camera_without_a_focal_length_is_refused(tmp_path: Path) -> None:
     """Asked for its focal length, pycolmap would end the process."""
     write(tmp_path, ring(2), ["EQUIRECTANGULAR 160 120 160 120"] * 2)
-    with pytest.raises(InputError, match="EQUIRECTANGULAR .* cannot be made a pinhole"):
+    with pytest.raises(InputError, match=r"EQUIRECTANGULAR .* cannot be made a pinhole"):
         Colmap().load(tmp_path, SceneOptions())
 
 

@@ -27,7 +27,7 @@ from invgraphics.renderers.splatting import Splatting, SplattingConfig
 from invgraphics.runs.folder import RunFolder
 from invgraphics.studies.approximations import field_of, isotropic_gaussians
 from invgraphics.testing import TwoBalls, toy_cameras
-from invgraphics.tools.export import ExportRequest, export_run
+from invgraphics.tools.export import PLANES, RESOLUTION, ExportRequest, export_run
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
 
@@ -240,8 +240,8 @@ def test_a_run_becomes_a_file(runs: dict[str, Path], tmp_path: Path, capsys, mon
 def test_bad_requests_get_a_sentence(runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main.run(["export", "--help"])
-    helped, defaults = " ".join(capsys.readouterr().out.split()), ExportRequest(tmp_path, "mesh", tmp_path)
-    assert all(f"(default: {default})" in helped for default in (defaults.resolution, defaults.planes))
+    helped = " ".join(capsys.readouterr().out.split())
+    assert all(f"(default: {default})" in helped for default in (RESOLUTION, PLANES))
     with pytest.raises(InputError, match="--resolution"):
         ExportRequest(runs["volumetric/hash"], "mesh", tmp_path / "a.ply", resolution=2)
     with pytest.raises(InputError, match="no density with a level"):
@@ -276,6 +276,8 @@ def test_a_fitted_density_is_seen_as_a_mesh(runs: dict[str, Path], toy_folder: P
     assert refitted.scores["psnr"] > shown.quality["psnr"].mean
     exported = export_run(ExportRequest(out, "mesh", source.parent / "refitted.glb"))
     assert exported.facts["surface"] == "the mesh of the field"
+    with pytest.raises(InputError, match=r"is a mesh already\.\nLeave --resolution out"):
+        export_run(ExportRequest(out, "mesh", source.parent / "a.glb", resolution=64))
     back = mesh_from_file(exported.path, run.scene)
     field = refitted.model.field
     torch.testing.assert_close(back.vertices, field.vertices, atol=1e-5, rtol=0)

@@ -107,6 +107,10 @@ def test_planes_are_written_as_they_are(scene: Scene, tmp_path: Path) -> None:
     with torch.no_grad():
         own = field.primitives(Quantity.PLANES, Context(scene.bounds))
     assert float((back.rgb - own.rgb).abs().max()) <= 0.5 / 255 + 1e-6
+    for idle, option in (({"view": "train0"}, "--view"), ({"planes": 64}, "--planes")):
+        with pytest.raises(InputError, match=rf"has planes of its own\.\nLeave {option} out"):
+            export_mpi(run, ExportRequest(Path("run"), "mpi", tmp_path / "c.zip", **idle))
+    assert not (tmp_path / "c.zip").exists()
     export_mpi(run, ExportRequest(Path("run"), "mpi", tmp_path / "b.zip"))
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
 

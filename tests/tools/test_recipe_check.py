@@ -50,6 +50,22 @@ def test_a_report_is_current_until_its_recipe_changes(tmp_path: Path, capsys: py
     assert "volumetric/forgotten" in told and "2 of 3 reports are not current: gone and old." in told
 
 
+def test_runs_of_no_recipe_alone_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Imported and converted ones, and pages without runs, such as a benchmark's."""
+    write(tmp_path / "mixed" / "runs" / "0", **current())
+    imported = {"file": "a.ply", "sha256": "0" * 64, "bytes": 9, "format": "ply", "axes": "opencv", "world": "opencv"}
+    imported |= {"gaussians": 1, "sh_degree": 0, "antialiased": None, "notes": []}
+    write(tmp_path / "mixed" / "runs" / "1", **(current() | {"budget": "imported", "imported": imported}))
+    assert check_recipes(tmp_path / "mixed").current
+    assert check_recipes(tmp_path / "mixed").runs == 1
+    for name in ("mixed", "bench"):
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "index.html").touch()
+    assert main.run(["report", "--check", str(tmp_path)]) == 0
+    assert "All 1 reports are current." in capsys.readouterr().out
+    assert main.run(["report", "--check", str(tmp_path / "bench")]) == 1
+
+
 @pytest.mark.parametrize(
     ("scene", "options", "is_current"),
     [

@@ -131,6 +131,9 @@ def test_pictures_of_another_tool_score_like_the_run_they_came_from(run: Path, t
         (theirs / side).mkdir(parents=True)
         for path in folder.glob("*.png"):
             shutil.copy(path, theirs / side / f"0{path.name}")
+    assert open_pictures(run, background=WHITE).background == WHITE
+    with pytest.raises(InputError, match=r"has the background 1,1,1\.\nLeave --background out"):
+        open_pictures(run, background=(0.0, 0.0, 0.0))
     got = scores_of(tmp_path / "model", "default", background=WHITE)
     expected = json.loads((run / "scores.json").read_text())["quality"]
     for metric in ("psnr", "ssim", "flip"):

@@ -197,6 +197,7 @@ def test_an_interrupted_inference_loses_at_most_one_instance(
 ) -> None:
     run = fitted_study / "runs/hypernetwork"
     request = InferRequest(run, tmp_path / "whole", views=(1, 2), tests=1, no_prior="2steps", steps=2)
+    assert "--scene '/other place/chairs'" in replace(request, scene="/other place/chairs").shell()
     whole = module.infer(request)
     drawn: list[Path] = []
 

@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from training_fixtures import SMALL
 
 from invgraphics.experiments.fitted import open_fitted
+from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import fit_run
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.tools.colorize import EMPTY, ERROR_LIMIT, resize_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera
 from invgraphics.viewer.loaded_run import LoadedRun, open_run
+from invgraphics.viewer.overlays import CameraFrustums, Overlays
 from invgraphics.viewer.progressive import ProgressiveRenderer, RenderRequest
 from invgraphics.viewer.resolution import MIN_PIXELS
 
@@ -226,3 +230,52 @@ def test_a_newer_checkpoint_is_noticed_and_shown(runs: dict[str, Path], tmp_path
     assert loaded.summary()["test views"] == "not scored yet" and not loaded.has_update()
     (run / CHECKPOINT).unlink()
     assert not loaded.has_update(), "a fit that starts again removes the file first"
+
+
+def test_cameras_follow_refined_poses(balls: Path, tmp_path: Path) -> None:
+    """A live view of a fit that refines poses: each checkpoint brings the cameras of then, and frustums are drawn anew."""
+    method = "splatting/gaussians"
+    overrides = (*SMALL[method], "training.poses.optimise=true")
+    run = fit_run(FitRequest(method=method, scene=str(balls), out=str(tmp_path / "run"), budget="3steps", overrides=overrides))
+    loaded, drawn = LoadedRun(open_fitted(run)), []
+    overlays = Overlays(_Drawn(drawn), loaded, CameraFrustums(loaded), lambda index: None)
+    list(overlays.update(splats=False, frustums=True, hidden=None))
+    assert len(drawn) == len(loaded.views())
+    assert not overlays.remove_outdated()
+    before = torch.stack([view.camera.position for view in loaded.scene.train])
+    state = checkpoint.load(run / CHECKPOINT)
+    state["poses"]["translation.0"] = state["poses"]["translation.0"] + 0.3
+    checkpoint.save(run / CHECKPOINT, state)
+    assert loaded.has_update()
+    loaded.reload()
+    after, fresh = (
+        torch.stack([view.camera.position for view in one.scene.train]) for one in (loaded, open_run(run, None, False, print))
+    )
+    assert float((after - before).norm(dim=1).max()) > 0.1
+    assert torch.equal(after, fresh)
+    assert overlays.remove_outdated()
+    list(overlays.update(splats=False, frustums=True, hidden=None))
+    assert len(drawn) == 2 * len(loaded.views())
+    assert sum(handle.gone for handle in drawn) == len(loaded.views())
+    torch.testing.assert_close(torch.tensor(drawn[-1].position), after[-1])
+
+
+class _Drawn:
+    """A viser scene that keeps its frustums."""
+
+    def __init__(self, drawn: list) -> None:
+        self._drawn = drawn
+
+    def add_camera_frustum(self, *_: object, **settings: object) -> "_Handle":
+        self._drawn.append(_Handle(settings["position"]))
+        return self._drawn[-1]
+
+
+class _Handle:
+    def __init__(self, position: object) -> None:
+        self.position, self.gone, self.visible = position, False, True
+
+    def remove(self) -> None:
+        self.gone = True
+
+    def on_click(self, _: object) -> None: ...

@@ -160,3 +160,30 @@ def test_what_is_forgotten_is_not_done(worker) -> None:
     go.set()
     worker.stop()
     assert done == []
+
+
+def test_what_is_cancelled_lets_go_at_once(worker) -> None:
+    """A film's encoder and folder, with no other task that would wake the thread; those left at the end too."""
+    ended, begun = [], threading.Event()
+
+    def film(name: str):
+        try:
+            begun.set()
+            while True:
+                yield 60.0
+        finally:
+            ended.append(name)
+
+    worker.submit("film", film("cancelled"))
+    begun.wait(5)
+    worker.cancel("film")
+    _wait(lambda: ended == ["cancelled"])
+    begun.clear()
+    worker.submit("film", film("replaced"))
+    begun.wait(5)
+    begun.clear()
+    worker.submit("film", film("left"))
+    begun.wait(5)
+    _wait(lambda: ended == ["cancelled", "replaced"])
+    worker.stop()
+    assert ended == ["cancelled", "replaced", "left"]

@@ -39,6 +39,7 @@ def test_bad_arguments(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
     _refused([run, "--max-size", "2"], "--max-size cannot be 2", capsys)
     _refused([run, "--port", "70000"], "--port cannot be 70000", capsys)
     _refused([run, "--host", "no.such.host.invalid"], "--host cannot be 'no.such.host.invalid'", capsys)
+    _refused([run, "--host", "a" * 64], f"--host cannot be '{'a' * 64}'", capsys)  # longer than a name's part can be
     _refused([run, "--host", "192.0.2.1"], "--host cannot be '192.0.2.1'", capsys)  # an address of nobody (RFC 5737)
 
 

@@ -65,11 +65,12 @@ def _processor() -> Iterator[Finding]:
     from invgraphics.experiments.environment import cpu_name
 
     cores, threads = os.cpu_count() or 1, torch.get_num_threads()
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else cores
     yield Finding("processor", f"{cpu_name()}, {cores} cores, {torch.backends.cpu.get_cpu_capability()} instructions")
-    remedy = (
-        "" if threads >= cores else "unset OMP_NUM_THREADS, or accept slower fits; scores are compared at equal threads only"
-    )
-    yield Finding("torch", f"{torch.__version__}, {threads} threads", remedy)
+    limited = threads < allowed and "OMP_NUM_THREADS" in os.environ
+    remedy = "unset OMP_NUM_THREADS, or accept slower fits; scores are compared at equal threads only" if limited else ""
+    pinned = f", for which {allowed} of {cores} cores are allowed" if allowed < cores else ""
+    yield Finding("torch", f"{torch.__version__}, {threads} threads{pinned}", remedy)
 
 
 def _kernels(warm_up: bool) -> Finding:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from invgraphics.cli.arguments import check_seed
 from invgraphics.errors import InputError
 from invgraphics.runs.folder import check_run
 
@@ -50,7 +51,7 @@ class Locate:
 
         from invgraphics.tools.localise import LocateRequest, locate
 
-        options = (self.near, self.start, self.starts, self.steps, self.fov, self.scene, self.seed)
+        options = (self.near, self.start, self.starts, self.steps, self.fov, self.scene, check_seed(self.seed))
         found = locate(LocateRequest(self.folder, self.photo, out, *options))
         print("camera to world, OpenCV axes:")
         for row in found.cam_to_world:

@@ -57,6 +57,17 @@ class Fitted:
         else:
             self.model.field.load_state_dict(state.get("field", {}))
 
+    def at_checkpoint(self, state: Mapping[str, Mapping[str, Any]]) -> Fitted:
+        """The run at another checkpoint: the same model, which takes over its tensors, and the poses of then.
+
+        Raises:
+            RuntimeError: they do not fit the model.
+        """
+        config = refined_poses(self.method)
+        known = Poses.restored(config, state["poses"]) if config is not None and "poses" in state else None
+        self.load(state)
+        return replace(self, poses=None if known is None else known.to(self.model.device))
+
     def in_its_frame(self) -> Fitted:
         """The same run with its scene transformed to the fit's frame, which drifts where poses are refined."""
         return self if self.poses is None else replace(self, scene=scene_in_fit_frame(self.poses, self.scene))
@@ -100,14 +111,10 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     if provenance.fitted_run is not None:
         model = replace(model, renderer=model.renderer.untrained())
     state = checkpoint.load(source.checkpoint, device)
-    config = refined_poses(method)
-    fitted = Fitted(folder, method, scene, model, source)
     try:
-        poses = Poses.restored(config, state["poses"]).to(device) if config is not None and "poses" in state else None
-        fitted.load(state)
+        return Fitted(folder, method, scene, model, source).at_checkpoint(state)
     except RuntimeError as error:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
-    return replace(fitted, poses=poses)
 
 
 def _method(folder: RunFolder, provenance: Provenance) -> Method:

@@ -120,6 +120,15 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
             raise InputError(sentence, "Choose another --out, or delete that folder.")
 
 
+def other_run(folder: RunFolder, method: str) -> InputError:
+    """Error of resuming a method's run in a folder that passed `check_replaceable`, but holds a run of another identity."""
+    named = folder.read(Provenance).method if folder.has(Provenance) else method
+    what = "of other code, threads, kernels or pictures of the same scene"
+    if named != method:
+        what = f"called '{named}', not '{method}'"
+    return InputError(f"{folder.root} holds a run {what}.", "Choose another --out.")
+
+
 def _normalised(budget: str) -> str:
     """A budget in one spelling; as it stands where a run has another word for it (``imported``)."""
     try:

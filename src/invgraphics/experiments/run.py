@@ -25,7 +25,7 @@ from invgraphics.experiments.clocks import at_step, disturbance, fit_costs, fit_
 from invgraphics.experiments.environment import code_version, continued, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
 from invgraphics.experiments.executors.local import cores
-from invgraphics.experiments.identity import check_existing, run_digest, truth_digest
+from invgraphics.experiments.identity import check_existing, other_run, run_digest, truth_digest
 from invgraphics.experiments.job import Job, make_training_scene, region_of
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
@@ -98,14 +98,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         identity = run_digest(job, truth_digest(scene), torch.get_num_threads())
         same = folder.identity == identity
         if request.existing == "resume" and folder.identity and not same:
-            named = folder.read(Provenance).method if folder.has(Provenance) else method.name
-            renamed, other = (
-                f"called '{named}', not '{method.name}'",
-                "of other code, threads, kernels or pictures of the same scene",
-            )
-            raise InputError(
-                f"{folder.root} holds a run {renamed if named != method.name else other}.", "Choose another --out."
-            )
+            raise other_run(folder, method.name)
         if same and folder.finished:
             for protocol in job.unscored():
                 evaluate_saved(folder, scene, protocol)

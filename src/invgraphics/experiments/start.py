@@ -120,9 +120,9 @@ class MemoryForecast:
 def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
     """Forecast peak memory: what a step and a monitor pass needed, plus what is still to be allocated.
 
-    To come are primitives with their gradients, moments and footprints, up-sampled lattices, pictures at full size where the fit
-    begins with smaller ones, more rays where empty space leaves fewer samples on each, and a checkpoint's copy of the parameters
-    and their moments.
+    To come are primitives with their gradients, moments and footprints, up-sampled lattices, pictures at full size where the
+    fit begins with smaller ones, more rays where empty space leaves fewer samples on each, and a checkpoint's copy of the
+    parameters and their moments.
     Empty space is not known yet, so that rays are as full of samples as they will ever be.
 
     Args:

@@ -33,8 +33,8 @@ BRIGHT = 2.0
 def read_points(path: Path) -> Points | None:
     """Read the vertices of a PLY file and their colours; ``None`` where there are none.
 
-    Colours are whole numbers up to 255, or up to 65535 where one exceeds that, or floats up to 1, or up to 255 where one exceeds
-    `BRIGHT`; without any, points are grey. Points that are not finite are left out.
+    Colours are whole numbers up to 255, or up to 65535 where one exceeds that, or floats up to 1, or up to 255 where one
+    exceeds `BRIGHT`; without any, points are grey. Points that are not finite are left out.
 
     Raises:
         InputError: it cannot be read, is no such file, or is cut off.

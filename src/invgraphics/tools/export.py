@@ -22,8 +22,8 @@ from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_fil
 
 RESOLUTION, RESOLUTIONS = 192, (8, 512)
 """Voxels along a mesh's longest edge: usual, fewest and most (for which fused pictures take 6 GB of memory)."""
-PLANES = 2, 512
-"""Fewest and most planes of a multi-plane image."""
+PLANES, PLANES_RANGE = 32, (2, 512)
+"""Planes of a multi-plane image: usual, fewest and most."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class ExportRequest:
         world: how the axes of the data set's world point, for formats that want certain axes; ``None`` for the
             format's default.
         level: density or signed distance of a mesh's surface; ``None`` for the default.
-        resolution: voxels along the longest edge that a mesh is made from.
+        resolution: voxels along the longest edge that a mesh is made from; ``None`` for `RESOLUTION`.
         sh_degree: degree of the spherical harmonics that are written, zeros where the run has fewer bands; ``None`` for what
             readers of the format expect: 3 for PLY, elsewhere the run's own.
-        planes: number of planes that a density is sliced into.
+        planes: number of planes that a density is sliced into; ``None`` for `PLANES`.
         view: training view whose camera is the reference of a multi-plane image; ``None`` for the mean of all.
     """
 
@@ -51,18 +51,19 @@ class ExportRequest:
     scene: str | None = None
     world: str | None = None
     level: float | None = None
-    resolution: int = RESOLUTION
+    resolution: int | None = None
     sh_degree: int | None = None
-    planes: int = 32
+    planes: int | None = None
     view: str | None = None
 
     def __post_init__(self) -> None:
-        if not PLANES[0] <= self.planes <= PLANES[1]:
-            raise InputError(f"--planes cannot be {self.planes}.", f"Expected {PLANES[0]} to {PLANES[1]}.")
+        low, high = PLANES_RANGE
+        if self.planes is not None and not low <= self.planes <= high:
+            raise InputError(f"--planes cannot be {self.planes}.", f"Expected {low} to {high}.")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= harmonics.MAX_DEGREE:
             raise InputError(f"--sh-degree cannot be {self.sh_degree}.", f"Expected 0 to {harmonics.MAX_DEGREE}.")
         low, high = RESOLUTIONS
-        if not low <= self.resolution <= high:
+        if self.resolution is not None and not low <= self.resolution <= high:
             raise InputError(f"--resolution cannot be {self.resolution}.", f"Expected a number of voxels, {low} to {high}.")
 
 

@@ -80,6 +80,7 @@ class InferRequest:
         words += ["--against", ",".join(map(str, self.against))] if self.against else []
         words += ["--instances", str(self.instances)] if self.instances is not None else []
         words += ["--no-prior", self.no_prior] if self.no_prior else []
+        words += ["--scene", self.scene] if self.scene else []
         return shlex.join([*words, "--steps", str(self.steps), "--out", str(self.out)])
 
 

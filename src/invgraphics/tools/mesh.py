@@ -13,7 +13,7 @@ from invgraphics.experiments.surface_scores import mesh_scores
 from invgraphics.fields.depth_fusion import TRUNCATION, fuse_depth
 from invgraphics.fields.isosurface import Extracted, default_level, extract_mesh, with_attributes
 from invgraphics.formats.mesh import AXES, UP, check_suffix, write_mesh
-from invgraphics.tools.export import Exported, ExportRequest
+from invgraphics.tools.export import RESOLUTION, Exported, ExportRequest
 from invgraphics.tools.file_frames import file_from_local
 
 MOST_PICTURES = 64
@@ -64,8 +64,9 @@ def _frame(axes: str | None) -> str:
 
 def _own_mesh(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
     """The field's mesh as it is."""
-    if request.level is not None:
-        raise InputError(f"The model of '{request.run}' is a mesh already.", "Leave --level out.")
+    given = {"--level": request.level, "--resolution": request.resolution}
+    if idle := [option for option, value in given.items() if value is not None]:
+        raise InputError(f"The model of '{request.run}' is a mesh already.", f"Leave {' and '.join(idle)} out.")
     mesh: Mesh = fitted.model.field.primitives(Quantity.MESH, fitted.model.context())
     if mesh.sh is None:
         mesh = with_attributes(mesh, fitted.model.field)
@@ -74,13 +75,13 @@ def _own_mesh(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
 
 def _marching_cubes(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
     """Extract the surface by marching cubes; also names the method in words."""
-    bounds = fitted.model.bounds
+    bounds, resolution = fitted.model.bounds, request.resolution or RESOLUTION
     remedy = "Choose another --level, or fit for longer."
-    extracted = extract_mesh(fitted.model.field, bounds, request.resolution, request.level, remedy)
+    extracted = extract_mesh(fitted.model.field, bounds, resolution, request.level, remedy)
     if Quantity.SDF in fitted.model.field.provides:
-        return extracted, f"signed distance {request.level or 0:g}, {request.resolution} voxels along the longest edge"
+        return extracted, f"signed distance {request.level or 0:g}, {resolution} voxels along the longest edge"
     level = default_level(bounds) if request.level is None else request.level
-    return extracted, f"density {level:.3g} per local unit, {request.resolution} voxels along the longest edge"
+    return extracted, f"density {level:.3g} per local unit, {resolution} voxels along the longest edge"
 
 
 def _fuse_depth(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]:
@@ -89,7 +90,7 @@ def _fuse_depth(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]
         remedy = "Leave --level out: its depth pictures are fused."
         raise InputError(f"The model of '{request.run}' ({fitted.method.name}) has no density with a level.", remedy)
     model = replace(fitted.model, renderer=fitted.model.renderer.for_depth_fusion())
-    scene = fitted.scene
+    scene, resolution = fitted.scene, request.resolution or RESOLUTION
     count = min(MOST_PICTURES, len(scene.train))
     views = [scene.train[round(index * (len(scene.train) - 1) / max(1, count - 1))] for index in range(count)]
     cameras = [view.camera for view in views]
@@ -99,9 +100,9 @@ def _fuse_depth(fitted: Fitted, request: ExportRequest) -> tuple[Extracted, str]
             reporter.show((index + 1) / count, f"view {index + 1} of {count}")
             return model.render(cameras[index])
 
-        extracted = fuse_depth(cameras, render, scene.bounds, request.resolution)
+        extracted = fuse_depth(cameras, render, scene.bounds, resolution)
     kind = model.renderer.depth_kind
-    how = f"{kind} depth of {count} training views, {request.resolution} voxels along the longest edge, band of {TRUNCATION:g}"
+    how = f"{kind} depth of {count} training views, {resolution} voxels along the longest edge, band of {TRUNCATION:g}"
     return extracted, how
 
 

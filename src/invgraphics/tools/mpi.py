@@ -17,7 +17,7 @@ from invgraphics.fields.planes import FixedPlanes, PlanesConfig
 from invgraphics.fields.slicing import slice_density
 from invgraphics.formats.mpi import PlaneFile, read_mpi, write_mpi
 from invgraphics.renderers.planes import PlaneRenderer
-from invgraphics.tools.export import Exported, ExportRequest, decibels
+from invgraphics.tools.export import PLANES, Exported, ExportRequest, decibels
 
 
 def export_mpi(fitted: Fitted, request: ExportRequest) -> Exported:
@@ -59,6 +59,10 @@ def planes_of(fitted: Fitted, request: ExportRequest) -> tuple[Planes, str]:
     """
     model, scene = fitted.model, fitted.scene
     if Quantity.PLANES in model.field.provides:
+        given = {"--planes": request.planes, "--view": request.view}
+        if idle := [option for option, value in given.items() if value is not None]:
+            sentence = f"The model of '{request.run}' ({fitted.method.name}) has planes of its own."
+            raise InputError(sentence, f"Leave {' and '.join(idle)} out.")
         with torch.no_grad():
             return model.field.primitives(Quantity.PLANES, model.context()), "the run's own planes"
     if Quantity.DENSITY | Quantity.RADIANCE not in model.field.provides:
@@ -66,7 +70,7 @@ def planes_of(fitted: Fitted, request: ExportRequest) -> tuple[Planes, str]:
             f"The model of '{request.run}' ({fitted.method.name}) has no density that could be sliced.",
             "Runs of volumetric methods, of Gaussians and of planes can be written as a multi-plane image.",
         )
-    config = PlanesConfig(count=request.planes)
+    config = PlanesConfig(count=request.planes or PLANES)
     if request.view is not None:
         scene = scene.with_views(train=tuple(view for view in scene.train if view.name == request.view))
         if not scene.train:

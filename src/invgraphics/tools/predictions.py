@@ -69,11 +69,17 @@ def open_pictures(folder: Path, truth: Path | None = None, background: Colour | 
         background: what pictures without alpha show where the scene is transparent. Runs know it.
 
     Raises:
-        InputError: something is missing, unreadable, or does not fit together.
+        InputError: something is missing, unreadable, or does not fit together, such as a background that is not a run's.
     """
     if not folder.is_dir():
         raise InputError(f"There is no folder '{folder}'.", "Give a run, or a folder of predicted pictures.")
-    return _open_run(folder, truth) if RunFolder(folder).has(Provenance) else _open_folder(folder, truth, background)
+    if not RunFolder(folder).has(Provenance):
+        return _open_folder(folder, truth, background)
+    pictures = _open_run(folder, truth)
+    if background is not None and pictures.background is not None and tuple(background) != tuple(pictures.background):
+        known = ",".join(f"{value:g}" for value in pictures.background)
+        raise InputError(f"The scene of the run '{folder}' has the background {known}.", "Leave --background out.")
+    return pictures
 
 
 def _open_run(folder: Path, truth: Path | None) -> PictureSet:

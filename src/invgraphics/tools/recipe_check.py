@@ -52,12 +52,15 @@ class RecipeCheck:
 def check_recipes(folder: Path) -> RecipeCheck:
     """Compare the recipe of every run below ``folder`` with today's under the same preset, overrides and budget.
 
+    Imported and converted runs do not count: their recipes are parts of other files and runs.
+
     Raises:
         InputError: there is no such folder, or a record is broken.
     """
     if not folder.is_dir():
         raise InputError(f"'{folder}' is no folder.", "Give the folder of a report.")
-    records = [RunFolder(path.parent).read(Provenance) for path in sorted(folder.rglob(Provenance.FILE))]
+    found = [RunFolder(path.parent).read(Provenance) for path in sorted(folder.rglob(Provenance.FILE))]
+    records = [one for one in found if one.imported is None and one.converted is None]  # others are of no recipe alone
     stale: dict[str, str] = {}
     seen: dict[tuple[str, ...], str | None] = {}
     for record in records:
@@ -89,9 +92,10 @@ def _overrides(command: str) -> list[str]:
 
 
 def summary(checks: Sequence[RecipeCheck]) -> str:
-    """How many reports are current, in a sentence."""
-    stale = [check.folder.name for check in checks if not check.current]
+    """How many of the reports that have runs to compare are current, in a sentence."""
+    compared = [check for check in checks if check.runs]
+    stale = [check.folder.name for check in compared if not check.current]
     if not stale:
-        return f"All {len(checks)} reports are current."
+        return f"All {len(compared)} reports are current."
     verb = "is" if len(stale) == 1 else "are"
-    return f"{len(stale)} of {len(checks)} reports {verb} not current: {listing(stale)}."
+    return f"{len(stale)} of {len(compared)} reports {verb} not current: {listing(stale)}."

@@ -100,6 +100,8 @@ def check_address(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
             probe.listen(1)
+    except UnicodeError as error:  # a name that the domain name system could not have
+        raise InputError(f"--host cannot be '{host[:80]}'.", "Expected an address of this machine.") from error
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise InputError(

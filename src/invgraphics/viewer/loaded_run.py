@@ -31,12 +31,12 @@ class LoadedRun:
     """A run with its model; only the render thread may use the model.
 
     Args:
-        fitted: the opened run.
+        fitted: the opened run, whose scene is moved to the fit's frame, anew for each checkpoint.
         stamps: of its files, taken before they were read; ``None`` for current ones.
     """
 
     def __init__(self, fitted: Fitted, stamps: Stamps | None = None) -> None:
-        self.fitted = fitted
+        self._opened, self.fitted = fitted, fitted.in_its_frame()
         self._stamps = stamps or file_stamps(fitted.folder, fitted.source)
         self.steps, self.seconds = self._progress()
 
@@ -115,9 +115,11 @@ class LoadedRun:
         self._stamps = file_stamps(fitted.folder, fitted.source)  # first: a file written meanwhile is newer
         state = checkpoint.load(fitted.source.checkpoint, fitted.model.device)
         try:
-            fitted.load(state)
+            loaded = self._opened.at_checkpoint(state)
         except RuntimeError as error:
             raise InputError(f"{fitted.source.root} has become another run.", "Start the viewer again.") from error
+        if loaded.poses is not None:
+            self.fitted = loaded.in_its_frame()
         self.steps, self.seconds = self._progress()
 
     def summary(self) -> dict[str, str]:
@@ -180,7 +182,7 @@ def open_run(run: Path, scene: str | None, live: bool, say: Callable[[str], None
     while missing_file(run):
         time.sleep(POLL)
     stamps = file_stamps(RunFolder(run), _source(run))
-    return LoadedRun(open_fitted(run, scene).in_its_frame(), stamps)
+    return LoadedRun(open_fitted(run, scene), stamps)
 
 
 def missing_file(run: Path) -> tuple[str, str] | None:

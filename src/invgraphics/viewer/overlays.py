@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from invgraphics.core import Gaussians, Quantity, Scene, View
+from invgraphics.core import Gaussians, Quantity
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.harmonics import BAND_0
 from invgraphics.core.transforms import quaternion_to_matrix
@@ -33,26 +33,25 @@ class CameraFrustums:
     """Camera frustums of a scene's photographs, with thumbnails that are made on first use.
 
     Args:
-        views: names and views.
-        scene: they belong to.
+        run: whose views they are.
     """
 
-    def __init__(self, views: Sequence[tuple[str, View]], scene: Scene) -> None:
-        self._views, self._scene = views, scene
+    def __init__(self, run: LoadedRun) -> None:
+        self._run = run
         self._thumbnails: dict[int, Picture] = {}
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self._run.views())
 
     def add(self, index: int, viser_scene: Any, on_click: Callable[[], Any]) -> Any:
         """Add one frustum to a viser scene; returns its handle. ``on_click`` is awaited when it is clicked."""
-        name, view = self._views[index]
+        name, view = self._run.views()[index]
         fov, aspect = fov_and_aspect(view.camera)
         handle = viser_scene.add_camera_frustum(
             f"/cameras/{index}",
             fov,
             aspect,
-            scale=FRUSTUM_SIZE * self._scene.extent,
+            scale=FRUSTUM_SIZE * self._run.scene.extent,
             thickness=1.5,
             thickness_units="screen",
             color=TEST_COLOUR if name.startswith("test") else TRAIN_COLOUR,
@@ -69,11 +68,11 @@ class CameraFrustums:
 
     def _thumbnail(self, index: int) -> Picture:
         if index not in self._thumbnails:
-            view = self._views[index][1]
+            view = self._run.views()[index][1]
             height, width = view.image.shape[:2]
             scale = min(1.0, THUMBNAIL / max(width, height))
             size = (max(1, round(width * scale)), max(1, round(height * scale)))
-            self._thumbnails[index] = true_image(view, self._scene, size)
+            self._thumbnails[index] = true_image(view, self._run.scene, size)
         return self._thumbnails[index]
 
 
@@ -93,6 +92,7 @@ class Overlays:
         self._viser_scene, self._run, self._views, self._on_click = viser_scene, run, frustums, on_click
         self._frustums: dict[int, Any] = {}
         self._splats: Any = None
+        self._shown = run.scene
 
     def update(self, splats: bool, frustums: bool, hidden: int | None) -> Iterator[float]:
         """Show or hide splats and frustums, except the one of the view ``hidden``; a task of the render thread."""
@@ -108,11 +108,21 @@ class Overlays:
             elif index in self._frustums and self._frustums[index].visible != wanted:
                 self._frustums[index].visible = wanted
 
-    def remove_splats(self) -> None:
-        """Remove the splats, whose model has changed; `update` adds the new ones."""
+    def remove_outdated(self) -> bool:
+        """Remove the splats, whose model has changed, and frustums that have moved; `update` adds the new ones.
+
+        Returns:
+            Whether cameras have moved, as those of a fit that refines their poses.
+        """
         if self._splats is not None:
             self._splats.remove()
             self._splats = None
+        moved, self._shown = self._shown is not self._run.scene, self._run.scene
+        if moved:
+            for handle in self._frustums.values():
+                handle.remove()
+            self._frustums.clear()
+        return moved
 
 
 def add_splats(run: LoadedRun, viser_scene: Any) -> Any:

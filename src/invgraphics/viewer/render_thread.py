@@ -1,14 +1,14 @@
 """The single render thread: newest task of each key, in slices.
 
 Kernels use all cores already, and a model must not be rendered while it is reloaded, so one thread does all work in turn. Tasks
-are generators: a task is cancelled by not resuming it.
+are generators: a cancelled task is closed between two slices, so that what it holds (a film's encoder and folder) goes at once.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Generator, Hashable, Iterator
 from dataclasses import dataclass
 
 Task = Iterator[float]
@@ -20,6 +20,7 @@ class _Entry:
     task: Task
     ready: float
     slices: int = 0
+    cancelled: bool = False
 
 
 class RenderThread(threading.Thread):
@@ -35,20 +36,28 @@ class RenderThread(threading.Thread):
         super().__init__(name="viewer-renders", daemon=True)
         self._on_error = on_error
         self._entries: dict[Hashable, _Entry] = {}
+        self._cancelled: list[tuple[Hashable, _Entry]] = []
         self._changed = threading.Condition()
         self._ended = False
 
     def submit(self, key: Hashable, task: Task) -> None:
         """Schedule ``task`` in place of any other of the same key."""
         with self._changed:
+            self._drop(key)
             self._entries[key] = _Entry(task, time.monotonic())
             self._changed.notify_all()
 
     def cancel(self, key: Hashable) -> None:
         """Remove the task of a key, if there is one."""
         with self._changed:
-            self._entries.pop(key, None)
+            self._drop(key)
             self._changed.notify_all()
+
+    def _drop(self, key: Hashable) -> None:
+        """Leave the task of a key, which may be running, to `run` to close."""
+        if (entry := self._entries.pop(key, None)) is not None:
+            entry.cancelled = True
+            self._cancelled.append((key, entry))
 
     def stop(self) -> None:
         """Stop and join the thread after the slice that is running."""
@@ -59,14 +68,13 @@ class RenderThread(threading.Thread):
             self.join()
 
     def run(self) -> None:
-        """Run tasks until `stop`."""
+        """Run tasks until `stop`, and close those that end unfinished."""
         while (found := self._await()) is not None:
             key, entry = found
-            try:
-                pause = next(entry.task, None)
-            except Exception as error:  # one failed image must not end the viewer
-                self._on_error(key, error)
-                pause = None
+            if entry.cancelled:
+                self._advance(key, _closing(entry.task))
+                continue
+            pause = self._advance(key, entry.task)
             with self._changed:
                 if self._entries.get(key) is not entry:
                     continue
@@ -75,10 +83,23 @@ class RenderThread(threading.Thread):
                 else:
                     entry.ready, entry.slices = time.monotonic() + pause, entry.slices + 1
 
+        for key, entry in (*self._cancelled, *self._entries.items()):
+            self._advance(key, _closing(entry.task))
+
+    def _advance(self, key: Hashable, task: Task) -> float | None:
+        """Run a slice of a task; ``None`` if it was the last."""
+        try:
+            return next(task, None)
+        except Exception as error:  # one failed image must not end the viewer
+            self._on_error(key, error)
+            return None
+
     def _await(self) -> tuple[Hashable, _Entry] | None:
-        """Wait for a task that is due; ``None`` after `stop`."""
+        """Wait for a task that is due or cancelled; ``None`` after `stop`."""
         with self._changed:
             while not self._ended:
+                if self._cancelled:
+                    return self._cancelled.pop()
                 now = time.monotonic()
                 ready = [(key, entry) for key, entry in self._entries.items() if entry.ready <= now]
                 if ready:
@@ -86,3 +107,10 @@ class RenderThread(threading.Thread):
                 times = [entry.ready - now for entry in self._entries.values()]
                 self._changed.wait(min(times) if times else None)
             return None
+
+
+def _closing(task: Task) -> Task:
+    """A task that ends another one where it stands."""
+    if isinstance(task, Generator):
+        task.close()
+    yield from ()

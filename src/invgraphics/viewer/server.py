@@ -67,9 +67,9 @@ class Viewer:
 
     def __init__(self, runs: Sequence[LoadedRun], address: Address, view: int, max_size: int) -> None:
         self._runs = runs
-        scene, views = runs[0].scene, runs[0].views()
+        scene = runs[0].scene
         self._worker = RenderThread(self._report_error)
-        self._shared = SharedState(ProgressiveRenderer(runs), self._worker, views, CameraFrustums(views, scene), view, max_size)
+        self._shared = SharedState(ProgressiveRenderer(runs), self._worker, CameraFrustums(runs[0]), view, max_size)
         self._sessions: dict[int, Session] = {}
         check = HostCheck(address.host)
         with redirect_stdout(io.StringIO()), check.applied():  # the command prints the address itself

@@ -100,7 +100,9 @@ class Session:
     def refresh(self) -> None:
         """Show a reloaded model; called by the render thread."""
         self._controls.update_summary()
-        self._overlays.remove_splats()
+        if self._overlays.remove_outdated() and self._view_index is not None:
+            self.go_to_view(self._view_index)
+            return
         self._submit("overlays", self._update_overlays())
         self._request_frame(skip_coarse=True)
 
@@ -218,11 +220,8 @@ class Session:
         run = self._runs[-1 if self._controls.layout.value == "second" else 0]
         output, box = self._controls.output.value, self._crop.box
         output = "prediction" if output in NEEDS_TRUTH else output
-        look = FilmLook(
-            output,
-            BACKGROUNDS[self._controls.background.value],
-            None if box is None else run.crop_to_local(box, self._scene),
-        )
+        box = None if box is None else run.crop_to_local(box, self._scene)
+        look = FilmLook(output, BACKGROUNDS[self._controls.background.value], box)
         cameras = film_cameras(path, run, int(self._controls.max_size.value))
         count = len(cameras)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from invgraphics.core import View
@@ -18,15 +17,18 @@ class SharedState:
     Attributes:
         renderer: of the runs.
         thread: runs render tasks.
-        views: names and views to choose from.
-        frustums: overlays of the same views.
+        frustums: overlays of `views`.
         start: index of the initial view.
         max_size: initial limit of the longer side, pixels.
     """
 
     renderer: ProgressiveRenderer
     thread: RenderThread
-    views: Sequence[tuple[str, View]]
     frustums: CameraFrustums
     start: int
     max_size: int
+
+    @property
+    def views(self) -> list[tuple[str, View]]:
+        """Names and views to choose from; their cameras change with the checkpoint where poses are refined."""
+        return self.renderer.runs[0].views()
