@@ -373,6 +373,10 @@ def test_the_points_of_a_comparison_are_chosen_from_python(
         ig.compare("toy.npz", [SPLATS], "2steps", out="untold", data={"inti": "scene"})
     untold = ig.compare("toy.npz", [SPLATS], "2steps", out="untold")
     assert "(data.init=sfm)" in capsys.readouterr().err and "--set data.init=sfm" in untold.record.command
+    # Fits are scored over the scene's own background, whatever they were fitted over, and so are the trivial baselines.
+    black = ig.compare("toy.npz", [SPLATS], "2steps", out="black", data={"background": "black"})
+    assert black.record.baselines == untold.record.baselines
+    assert black.record.scene_info.background == untold.record.scene_info.background
 
 
 def test_a_lone_method_renderer_or_seed_needs_no_list(in_process) -> None:

@@ -45,6 +45,23 @@ def test_pairs_are_those_of_the_reference() -> None:
         assert torch.equal(found[1], expected[1])
 
 
+@pytest.mark.parametrize("sigma", [1e-2, 1e-4, 3e-5])
+def test_no_small_gaussian_is_lost(sigma: float) -> None:
+    """Of Gaussians far smaller than their distance, each within 2.5 standard deviations of a ray through it: all are found."""
+    (camera,) = toy_cameras(1, 96)
+    rays, generator, n = camera.rays(), torch.Generator().manual_seed(0), 1500
+    hit = torch.randperm(len(rays), generator=generator)[:n]
+    aside = torch.linalg.cross(
+        rays.directions[hit], torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
+    )
+    aside = torch.nn.functional.normalize(aside, dim=1) * (2.5 * sigma * torch.rand(n, 1, generator=generator))
+    means = rays.origins[hit] + 4 * rays.directions[hit] + aside
+    small = replace(blobs(n, 0), means=means, scales=torch.full((n, 3), sigma))
+    ray, gaussian = choose("gaussian_pairs", means)(precompute(small, "peak", 1e-7), rays)[:2]
+    found = set(zip(ray.tolist(), gaussian.tolist(), strict=True))
+    assert found >= set(zip(hit.tolist(), range(n), strict=True))
+
+
 @pytest.mark.parametrize(
     ("opacity", "attenuated", "steps"),
     [("peak", True, 32), ("physical", True, 20), ("extinction", False, 49), ("peak", True, 2)],
@@ -148,3 +165,16 @@ def test_nothing_in_view() -> None:
     primitives = precompute(blobs(5, 0), "peak", SMALLEST)
     away = Rays.make(torch.full((4, 3), 50.0), torch.tensor([[1.0, 0.0, 0.0]]).expand(4, 3))
     assert not gaussian_integrals(primitives, away, 8).any()
+
+
+@pytest.mark.parametrize("name", ["reference", "numba"])
+def test_a_ray_that_ends_before_it_begins_shows_nothing(name: str) -> None:
+    """``far < near`` marks a ray that misses; with gradients of distances the reference computes it."""
+    primitives = precompute(blobs(20, 0), "peak", SMALLEST)
+    moving = replace(primitives, means=primitives.means.clone().requires_grad_())
+    rays = Rays.make(torch.tensor([[0.1, -3, 0.0], [0.0, -3, 0.2]]), torch.tensor([[0.0, 1, 0]]).repeat(2, 1))
+    rays = rays.within(torch.tensor([3.2, 2.0]), torch.tensor([2.8, 5.0]))
+    with kernels.using(name):
+        sums = gaussian_composites(moving, rays, None, 1)
+    assert not bool(sums[0].any())
+    assert bool(sums[1].any())

@@ -60,16 +60,40 @@ def test_times_of_a_slower_or_faster_processor_are_not_ranked() -> None:
     comparison = Comparison("s", "?", ("fast", "mid", "slow"), runs, budget="60s")
     summary = summarise(comparison)
     assert summary.disturbances == (
-        "The times of fast are not ranked: seed 0 had a processor that did 30 % less per second than in the median fit, "
-        "so fewer steps in equal time.",
-        "The times of slow are not ranked: seed 1 had a processor that did 18 % more per second than in the median fit, "
-        "so more steps in equal time.",
+        "The times of fast are not ranked: seed 0 had a processor that a probe found 30 % slower than beside the median fit.",
+        "The times of slow are not ranked: seed 1 had a processor that a probe found 18 % faster than beside the median fit.",
     )
     assert _best(summary, "render_fps") == []
     assert dict(shared_facts(comparison))["processor speed during the fits"] == "0.70 to 1.18 of the median"
     busy = replace(runs[0], scores=replace(runs[0].scores, disturbed=TOLD))
     both = summarise(replace(comparison, runs=(busy, *runs[1:]))).disturbances[0]
-    assert both.startswith(f"The times of fast are not ranked: seed 0 {TOLD}, and had a processor that did 30 % less")
+    assert both.startswith(f"The times of fast are not ranked: seed 0 {TOLD}, and had a processor that a probe found 30 %")
+
+
+def test_quality_in_equal_seconds_is_not_ranked_either_where_a_fit_had_less_of_them() -> None:
+    """One fit had half of its core. On a machine that is busy throughout all have less, and may be compared."""
+    runs = [_run(method, seed, fps) for method, fps in (("fast", 90.0), ("mid", 50.0), ("slow", 20.0)) for seed in (0, 1)]
+
+    def with_share(run: Run, share: float) -> Run:
+        cost, told = run.scores.cost | {"fit_processor_share": share}, TOLD if share < 0.85 else ""
+        scores = replace(run.scores, cost=cost, disturbed=told)
+        return replace(run, scores=scores, provenance=replace(run.provenance, budget="60s"))
+
+    def with_shares(*shares: float) -> Comparison:
+        timed = map(with_share, runs, shares)
+        return Comparison("s", "?", ("fast", "mid", "slow"), tuple(timed), budget="60s")
+
+    one = with_shares(0.5, 1.0, 1.0, 1.0, 0.99, 1.0)
+    assert _best(summarise(one), "psnr") == ["mid"]
+    assert summarise(one).disturbances[0].startswith("The times and the quality of fast are not ranked: seed 0")
+    steps = replace(one, runs=tuple(replace(r, provenance=replace(r.provenance, budget="500steps")) for r in one.runs))
+    assert _best(summarise(steps), "psnr") == ["fast"]
+    busy = summarise(with_shares(0.5, 0.52, 0.5, 0.51, 0.5, 0.55))
+    assert _best(busy, "psnr") == ["fast"] and len(busy.disturbances) == 3
+    observations = [Observation(run, "s", {METHOD: run.method}) for run in one.runs]
+    (effect,) = effects_of([Contrast(METHOD, "mid", "fast")], summarise(one).columns[0], observations)
+    assert effect.disturbed == 1 and effect.estimate.seeds == (2, 1)
+    assert "Left out is 1 fit with less processor time than others in equal seconds." in effect_sentence(effect)
 
 
 def test_two_fits_and_unmeasured_ones_have_no_usual_speed() -> None:

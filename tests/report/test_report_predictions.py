@@ -281,6 +281,18 @@ def test_a_scene_that_says_the_opposite_leaves_a_prediction_undecided() -> None:
     assert (contrary.verdict, contrary.reason) == ("undecided", "held on s9")
 
 
+def test_a_prediction_for_all_scenes_is_about_those_without_fits_too() -> None:
+    """Failed throughout, or not run yet."""
+    made = gains(3.0, 2.9, 3.1)
+    scenes = ("s0", "s1", "s2", "s3")
+    assert judge_predictions([BETTER], made, scenes=scenes[:3])[0].verdict == "held"
+    (missing,) = judge_predictions([BETTER], made, scenes=scenes)
+    assert (missing.verdict, missing.reason) == ("undecided", "no fits of all sides on s3")
+    lost = [Lost("s3", {"method": method, N: "4"}) for method in (SPLAT, EXACT)]
+    (failed,) = judge_predictions([BETTER], made, lost, scenes)
+    assert (failed.verdict, failed.lost) == ("undecided", 2)
+
+
 def test_scenes_without_fits_leave_a_prediction_undecided() -> None:
     wanted = replace(BETTER, scenes=("s0", "s1", "s2"))
     assert judge_predictions([wanted], gains(3.0, 2.9, 3.1))[0].verdict == "held"

@@ -132,10 +132,11 @@ def nerf_fit(pictures: Scene, levels: int, log2_size: int, hidden: int, warm_ste
 def nerf_step(sizes: dict[str, int], effort: Effort) -> list[Measurement]:
     """Training step of a hash grid (march, encode, networks, composite, Adam) against its two networks alone."""
     running = nerf_fit(nerf_scene(), **sizes, warm_steps=WARM_STEPS)
+    running.refresh_cycle()  # in which the number of rays adapts
+    counted, rays = running.counter.samples, running.counter.rays
+    counted.clear()
+    rays.clear()
     timings = alternate({NERF_SHARE: networks_alone(running.field, SAMPLES), NERF_STEP: running.refresh_cycle}, effort)
-    # The number of rays adapts during the first cycle, which is discarded where there is another.
-    settled = REFRESH if len(running.counter.samples) > REFRESH else 0
-    counted, rays = running.counter.samples[settled:], running.counter.rays[settled:]
     per_step = sum(counted) / len(counted)
     note = f"{per_step:.0f} samples on {sum(rays) / len(rays):.0f} rays per step"
     threads, step = torch.get_num_threads(), timings[NERF_STEP].per(REFRESH)

@@ -121,7 +121,7 @@ _KERNELS = (
     "SSIM's filters with the matrix product."
 )
 _STEPS = (
-    "A whole step of a fit (draw, render, compare, differentiate, Adam; for the hash grid also its share of a style at the "
+    "A whole step of a fit (draw, render, compare, differentiate, Adam; for the hash grid also its share of an update of the "
     "occupancy grid) beside what it cannot do without: project, bin and rasterise there and back on the same pictures, or the "
     "two networks alone on as many samples in the same chunks. The rate ratio compares Gaussians or samples per second."
 )

@@ -17,6 +17,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, open_with_progress
 from invgraphics.experiments.compare_folders import any_finished, check_folders, made_before, missing_fits, name_others
 from invgraphics.experiments.environment import environment
+from invgraphics.experiments.evaluate import scene_as_trained
 from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.identity import check_replaceable
 from invgraphics.experiments.job import Job
@@ -62,12 +63,12 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     request, choice, opened = (request, "", None) if request.methods else _choose_methods(request)
     if opened is None and any_finished(request):
         opened = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, request.spp))
-    request, jobs, scene, refused = _resolve(request, opened)
+    request, jobs, scenes, refused = _resolve(request, opened)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
     name_others(request)
     earlier, made = any_finished(request), made_before(request, jobs, opened)
-    summary = replace(_summary(request, jobs, scene), refused=tuple(refused), method_choice=choice)
+    summary = replace(_summary(request, jobs, *scenes), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
     try:
         with closing(LocalExecutor().run(missing_fits(request, jobs), folder.root / "jobs")) as outcomes:
@@ -103,7 +104,9 @@ def _choose_methods(request: CompareRequest) -> tuple[CompareRequest, str, Scene
     return replace(request, methods=methods), f"chosen for {reason}", scene
 
 
-def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[CompareRequest, list[Job], Scene, list[Refusal]]:
+def _resolve(
+    request: CompareRequest, opened: Scene | None = None
+) -> tuple[CompareRequest, list[Job], tuple[Scene, Scene], list[Refusal]]:
     """Resolve one job per method with the first seed, and open the scene with that seed's data degradation.
 
     Args:
@@ -111,7 +114,8 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
         opened: its scene, where it is open already.
 
     Returns:
-        The request without the optional methods that do not go with the scene; its jobs; the scene; the refused methods.
+        The request without the optional methods that do not go with the scene; its jobs; the scene as loaded, and degraded; the
+        refused methods.
 
     Raises:
         InputError: anything that could be wrong, before any time is spent.
@@ -135,7 +139,7 @@ def _resolve(request: CompareRequest, opened: Scene | None = None) -> tuple[Comp
     jobs, unsuitable = _suitable(request, jobs, scene)
     request = replace(request, methods=tuple(job.request.method for job in jobs))
     check_variants(jobs[0].variants, [job.method for job in jobs], full)
-    return request, jobs, scene, [*refused, *unsuitable]
+    return request, jobs, (full, scene), [*refused, *unsuitable]
 
 
 def _jobs(request: CompareRequest) -> tuple[list[Job], list[Refusal]]:
@@ -196,8 +200,11 @@ def _refusal(request: CompareRequest, method: str, error: InputError) -> Refusal
     return Refusal(method=method, reason=error.sentence)
 
 
-def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> ComparisonRecord:
-    """Make the comparison's record, without its runs: scene, methods, protocol, baselines and environment."""
+def _summary(request: CompareRequest, jobs: Sequence[Job], full: Scene, scene: Scene) -> ComparisonRecord:
+    """Make the comparison's record, without its runs: scene, methods, protocol, baselines and environment.
+
+    Baselines are scored like the fits, over the background of the scene as loaded.
+    """
     protocol, budget = jobs[0].protocol, jobs[0].budget
     camera = scene.test[0].camera
     names = ", ".join(request.methods) if len(request.methods) <= MOST_NAMES else f"{len(request.methods)} methods"
@@ -206,7 +213,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         "test_poses": {protocol_note(method) for method in methods} - {""},
         "test_exposure": _of_methods({method.name: exposure_note(method, scene) for method in methods}),
     }
-    baselines = baseline_scores(scene, protocol)
+    baselines = baseline_scores(scene_as_trained(full, jobs[0].data.changes(), request.seeds[0]), protocol)
     return ComparisonRecord(
         scene=scene.name,
         question=f"Given {budget} of optimisation each, how well do {names} show new views, at what cost?",
@@ -225,7 +232,7 @@ def _summary(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> Comp
         baselines=baselines,
         noise_ceiling=scene.noise_ceiling,
         protocol=protocol.record() | {key: "; ".join(sorted(found)) for key, found in notes.items() if found},
-        scene_info=_scene_facts(scene),
+        scene_info=_scene_facts(replace(scene, background=full.background)),
         environment=environment(jobs[0].device),
         runs=(),
     )

@@ -220,7 +220,7 @@ def splat_rasterise(
 
     Args:
         footprints: conics, or discs where ``homography`` is set.
-        features: what to sum, per footprint (colour, depth coefficients, normals).
+        features: what to sum, per footprint (colour, depth coefficients, normals), at least one channel.
         width: image width in pixels.
         height: image height in pixels.
         tile: edge of a tile in pixels (Numba: in fours, 32 at most); ``None`` for the implementation's own.
@@ -228,7 +228,12 @@ def splat_rasterise(
 
     Returns:
         Sums of w * features and of w per pixel, differentiable in means2d, conics (or homography), opacities and features.
+
+    Raises:
+        ValueError: there are no channels.
     """
+    if not features.shape[1]:
+        raise ValueError("Features need at least one channel.")
     return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile, max_grad_splats)
 
 

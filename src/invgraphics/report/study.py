@@ -126,7 +126,7 @@ def _draw(study: Study, folder: Folder, root: Path) -> StudyPage:
     crossed = cross_effects(observations, study.approximations, study.factors, clean)
     heat = draw_heat_maps(study.factors, quantities[0], observations, folder.figures) if quantities else []
     analyses = draw_analyses(root, study.analyses, folder.figures)
-    judged = judge_predictions(study.predictions, observations, study.lost())
+    judged = judge_predictions(study.predictions, observations, study.lost(), study.scenes)
     return StudyPage(study, parts, contrasts, heat, quantities[0] if quantities else None, analyses, crossed, judged)
 
 

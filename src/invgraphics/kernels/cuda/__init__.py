@@ -1,7 +1,7 @@
 """Float32 kernels for NVIDIA GPUs, in Triton, which is part of every CUDA build of torch for Linux: nothing else to install.
 
-Other operations fall back to the reference, which runs on any device. Gradients of hash tables and of splats are accumulated
-atomically, in no fixed order: repeated runs agree to rounding, not bitwise.
+Other operations fall back to the reference, which runs on any device. Gradients of hash tables, lattices and splats are
+accumulated atomically, in no fixed order: repeated runs agree to rounding, not bitwise.
 """
 
 from invgraphics.kernels.cuda.composite import composite as composite

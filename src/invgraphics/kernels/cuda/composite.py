@@ -88,7 +88,7 @@ def accumulate_backward(
 
 
 class _Composite(torch.autograd.Function):
-    """Differentiable in transmitted depths and channels."""
+    """Differentiable in optical depths and channels."""
 
     @staticmethod
     def forward(ctx: Any, optical_depth: Tensor, channels: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor, Tensor]:

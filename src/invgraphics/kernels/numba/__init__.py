@@ -1,8 +1,10 @@
 """Float32 kernels for the CPU, compiled by Numba at first use and cached on disk.
 
 `runtime` holds the compiler settings; the operations are those of `invgraphics.kernels`. Cases without a compiled kernel fall
-back to the reference: discs, optimised intrinsics, gradients through `Footprints.depth_planes`, the Jacobian of the hash
-encoding, second derivatives of the lattice encoding, fused rendering of hash grids with other than two features per entry.
+back to the reference, among them: discs, optimised intrinsics, gradients through `Footprints.depth_planes`, the Jacobian of the
+hash encoding, second derivatives of the lattice encoding, fused rendering of hash grids with other than two features per entry,
+fused marches of cones, integrals of splats, ordered Gaussians with extra features and gradients, gradients of a density's
+positions, pictures narrower than SSIM's window.
 """
 
 from invgraphics.kernels.numba.adam import adam_rows as adam_rows

@@ -101,8 +101,9 @@ def near_points(
     known = points.detach()
     lo = known.amin(dim=0)
     size = (known.amax(dim=0) - lo).double()
-    # A little wider than the radius, so that rounding puts no neighbour into the cell after the next.
-    edge = max(radius * (1 + 1e-5), 1e-12)
+    # A little wider than the radius, so that rounding, up to about 1e-7 of the cells along an edge, puts no neighbour into the
+    # cell after the next.
+    edge = max(radius * (1 + 1e-4), 1e-12)
     while math.prod((size / edge + 1).long().tolist()) > MOST_CELLS:
         edge *= 1.25
     shape = (size / edge).long().numpy() + 1

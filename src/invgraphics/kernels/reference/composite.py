@@ -25,7 +25,7 @@ def transmittance(tau: Float[Tensor, " m"], ray: Int[Tensor, " m"], rays: int) -
     """Transmittance before each sample, exp(-sum of nearer optical depths); depths in float64, at most `OPAQUE`.
 
     One running sum over all samples, minus its value at each ray's start: in float32 the difference of two large sums would
-    lose the digits that late rays need.
+    lose the digits that late rays need. A depth that is NaN makes all later rays NaN, where compiled kernels lose its ray only.
     """
     running = torch.cat([tau.new_zeros(1), tau.cumsum(0)])[:-1]
     counts = torch.bincount(ray, minlength=rays)

@@ -102,7 +102,8 @@ def _radiance(
         raw = harmonics.evaluate(features.unflatten(1, (3, -1)).mT, direction)
     elif head.kind == "mlp":
         if head.octaves:
-            phases = (features[:, :, None] * 2.0 ** torch.arange(head.octaves)).flatten(1)
+            octaves = torch.arange(head.octaves, device=features.device)
+            phases = (features[:, :, None] * 2.0**octaves).flatten(1)
             raw = torch.cat([features, phases.sin(), phases.cos()], dim=1)
         raw = _network(head.net, torch.cat([raw, _seen_from(head, direction)], dim=1), hidden)
     if head.activation == "sigmoid":
@@ -116,6 +117,6 @@ def _seen_from(head: ColourHead, direction: Float[Tensor, "m 3"]) -> Float[Tenso
         return harmonics.basis(direction, head.degree - 1)
     if head.direction == "none":
         return direction[:, :0]
-    scales = torch.pi * 2.0 ** torch.arange(head.degree, dtype=direction.dtype)
+    scales = torch.pi * 2.0 ** torch.arange(head.degree, dtype=direction.dtype, device=direction.device)
     phases = (direction[:, None, :] * scales[:, None]).flatten(1)
     return torch.cat([direction, phases.sin(), phases.cos()], dim=1)

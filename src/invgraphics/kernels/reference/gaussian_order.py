@@ -41,7 +41,7 @@ def composite_in_order(
             ((limit - t) / sigma).clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
             for limit in (near, far.minimum((t + MAX_DEVIATIONS * sigma).detach()))
         )
-        depth = depth * (phi(end) - phi(start))
+        depth = depth * (phi(end) - phi(start)).clamp_min(0)  # of a ray that misses, far < near
     composite = choose("composite", t)
     ordered, _, _ = composite(depth[order], t.new_zeros(len(t), 0), intersections.ray, len(rays))
     weights = ordered[order.argsort()]

@@ -159,11 +159,17 @@ def scene_comparisons(study: Study) -> list[Comparison]:
         truths = list(dict.fromkeys(_truth_of(run) for _, run in runs)) or [None]
         for index, truth in enumerate(truths):
             kept = [(cell, run) for cell, run in runs if _truth_of(run) == truth]
-            failures = [cell for cell in here if cell.status == "failed"] if index == 0 else []
+            failures = [cell for cell in here if cell.status == "failed" and _shown_in(cell, runs, truths) == index]
             variants = dict.fromkeys(cell.variant for cell in here if cell in failures or any(cell is one for one, _ in kept))
             title = scene if len(truths) == 1 else f"{scene}, truth {index + 1} of {len(truths)}"
             comparisons.append(_comparison(study, title, tuple(variants), tuple(run for _, run in kept), failures))
     return [comparison for comparison in comparisons if comparison.methods]
+
+
+def _shown_in(failed: StudyCell, runs: Sequence[tuple[StudyCell, Run]], truths: Sequence[Any]) -> int:
+    """Index of the truth that a failed fit would have had: that of its variant's other seeds; 0 where there is none."""
+    alike = [truths.index(_truth_of(run)) for cell, run in runs if cell.variant == failed.variant]
+    return min(alike, default=0)
 
 
 def _truth_of(run: Run) -> tuple[Any, ...]:

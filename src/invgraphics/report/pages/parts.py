@@ -188,7 +188,8 @@ def draw_contrasts(
     """
     every = ((quantity, effects_of(contrasts, quantity, *observed, factors=factors)) for quantity in quantities)
     tables = tuple((quantity, found) for quantity, found in every if found)
-    words = disturbed_words(max((len(disturbed_fits(observed[0], quantity)) for quantity in quantities), default=0))
+    told = (disturbed_words(len(disturbed_fits(observed[0], quantity)), quantity) for quantity in quantities)
+    words = " ".join(dict.fromkeys(filter(None, told)))
     return Contrasts(tables, draw_intervals(tables[0][1], folder.figures) if tables else None, words)
 
 

@@ -171,6 +171,10 @@ def _progress(study: Study) -> list[str]:
     versions = {cell.run.provenance.code_version for cell in study.cells if cell.run}
     if len(versions) > 1:
         sentences.append(f"Cells were made by {len(versions)} versions of the code; each run's facts name its own.")
+    fits = [cell.run.provenance for cell in study.cells if cell.run]
+    threads = sorted({one.threads for one in fits if one.threads and one.budget and "step" not in one.budget})
+    if len(threads) > 1:
+        sentences.append(f"Fits of equal seconds had {listing(map(str, threads))} threads, and so unequal numbers of steps.")
     if skipped := [cell for cell in study.cells if cell.status == "skipped"]:
         reasons = listing(dict.fromkeys(cell.error for cell in skipped))
         sentences.append(f"{len(skipped)} of {total} cells were skipped: {reasons}.")

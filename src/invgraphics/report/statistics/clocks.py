@@ -45,9 +45,8 @@ class Speeds:
         speed, found = _speed(run), [run.scores.disturbed] if run.scores.disturbed else []
         ratio = speed / self.median if speed and self.median else 1.0
         if not LEAST_RATIO <= ratio <= 1 / LEAST_RATIO:
-            less, fewer = ("less", "fewer") if ratio < 1 else ("more", "more")
-            change = f"{100 * abs(ratio - 1):.0f} % {less}"
-            found.append(f"had a processor that did {change} per second than in the median fit, so {fewer} steps in equal time")
+            change = f"{100 * abs(ratio - 1):.0f} % {'slower' if ratio < 1 else 'faster'}"
+            found.append(f"had a processor that a probe found {change} than beside the median fit")
         return ", and ".join(found)
 
     @property
@@ -56,14 +55,32 @@ class Speeds:
         return "" if self.median is None else f"{self.least:.2f} to {self.most:.2f} of the median"
 
 
+def short_of_time(runs: Sequence[Run]) -> list[Run]:
+    """Fits of a budget of seconds with much less of their processor time than the fit with most: fewer steps, lower quality."""
+    shares = {id(run): share for run in runs if _by_time(run) and (share := run.scores.cost.get("fit_processor_share"))}
+    most = max(shares.values(), default=0.0)
+    return [run for run in runs if shares.get(id(run), most) < LEAST_RATIO * most]
+
+
 def disturbed_fits(observations: Sequence[Observation], quantity: MeasuredQuantity) -> list[Observation]:
-    """Fits whose value of a quantity is a time that is not to be compared; the usual speed is that of their scene's fits."""
-    if quantity.key not in TIMES:
+    """Fits whose value of a quantity is not to be compared with other fits' of their scene.
+
+    Of times these are the fits whose clock was disturbed, of qualities those that are `short_of_time`.
+    """
+    if quantity.key not in TIMES and quantity.group == "cost":
         return []
-    speeds = {
-        name: Speeds.of([one.run for one in observations if one.scene == name]) for name in {one.scene for one in observations}
-    }
-    return [one for one in observations if speeds[one.scene].disturbance(one.run)]
+    left_out: set[int] = set()
+    for scene in {one.scene for one in observations}:
+        runs = [one.run for one in observations if one.scene == scene]
+        speeds = Speeds.of(runs)
+        found = [run for run in runs if speeds.disturbance(run)] if quantity.key in TIMES else short_of_time(runs)
+        left_out |= set(map(id, found))
+    return [one for one in observations if id(one.run) in left_out]
+
+
+def _by_time(run: Run) -> bool:
+    """Whether a fit's budget was in seconds."""
+    return bool(run.provenance.budget) and "step" not in run.provenance.budget
 
 
 def _speed(run: Run) -> float | None:

@@ -85,11 +85,14 @@ class JudgedPrediction:
 
 
 def judge_predictions(
-    predictions: Sequence[Prediction], observations: Sequence[Observation], lost: Iterable[Lost] = ()
+    predictions: Sequence[Prediction],
+    observations: Sequence[Observation],
+    lost: Iterable[Lost] = (),
+    scenes: Sequence[str] = (),
 ) -> list[JudgedPrediction]:
-    """Judge each prediction by a study's finished runs and failed fits."""
-    failures = list(lost)
-    return [_judge(prediction, observations, failures) for prediction in predictions]
+    """Judge each prediction by a study's finished runs and failed fits, those without scenes of their own on all of its scenes."""
+    failures, known = list(lost), tuple(dict.fromkeys([*scenes, *(one.scene for one in observations)]))
+    return [_judge(prediction, observations, failures, prediction.scenes or known) for prediction in predictions]
 
 
 def predictions_sentence(judged: Sequence[JudgedPrediction]) -> str:
@@ -99,13 +102,14 @@ def predictions_sentence(judged: Sequence[JudgedPrediction]) -> str:
     return f"Of {len(judged)} {'prediction' if len(judged) == 1 else 'predictions'}: {listing(parts)}."
 
 
-def _judge(prediction: Prediction, observations: Sequence[Observation], failures: Sequence[Lost]) -> JudgedPrediction:
+def _judge(
+    prediction: Prediction, observations: Sequence[Observation], failures: Sequence[Lost], names: Sequence[str]
+) -> JudgedPrediction:
     scored = [one for one in observations if prediction.metric in one.run.scores.quality]
     if not scored:
         reason = f"no finished fit has the metric {prediction.metric}"
         return JudgedPrediction(prediction, None, None, (), 0, "open", reason)
     quantity = quality_quantity(prediction.metric, scored[0].run.scores.quality[prediction.metric])
-    names = prediction.scenes or tuple(dict.fromkeys(one.scene for one in observations))
     terms = _terms(prediction)
     found = {name: _groups(terms, quantity, [one for one in scored if one.scene == name]) for name in names}
     known = {name: groups for name, (groups, _) in found.items() if groups}
@@ -119,19 +123,19 @@ def _judge(prediction: Prediction, observations: Sequence[Observation], failures
         return JudgedPrediction(prediction, quantity, None, (), count, "open", reason)
     across = over_scenes(list(known.values()), least_error=value.error, scores=size) if len(known) > 1 else None
     claim = value if across is None else across
-    reason = _unsettled(prediction, claim, known, count)
+    reason = _unsettled(prediction, claim, known, count, [name for name in names if name not in known])
     verdict = "undecided" if reason else _within(prediction, claim)
     return JudgedPrediction(prediction, quantity, value, tuple(known), count, verdict, reason, across)
 
 
-def _unsettled(prediction: Prediction, claim: Estimate, known: Mapping[str, Groups], lost: int) -> str:
+def _unsettled(prediction: Prediction, claim: Estimate, known: Mapping[str, Groups], lost: int, missing: Sequence[str]) -> str:
     """Why a prediction is undecided whatever the interval of all scenes says; empty where that decides it.
 
     A scene contradicts by its own interval, which is corrected for their number (Bonferroni).
     """
     if lost:
         return f"{lost} {'fit' if lost == 1 else 'fits'} lost"
-    if missing := [name for name in prediction.scenes if name not in known]:
+    if missing:
         return f"no fits of all sides on {listing(missing)}"
     if claim.unit == "none":
         return f"no interval from {claim.size}"

@@ -9,7 +9,7 @@ from invgraphics.report.data.factors import METHOD, Factor, Observation
 from invgraphics.report.data.variants import level_words
 from invgraphics.report.statistics.effects import Effect, Verdict
 from invgraphics.report.statistics.intervals import POWER, Estimate
-from invgraphics.report.wording import MeasuredQuantity, listing, metric_label
+from invgraphics.report.wording import TIMES, MeasuredQuantity, listing, metric_label
 
 FEW_SCENES = 5
 """Fewer scenes than this tell little about others, and the sentence says so."""
@@ -19,15 +19,21 @@ MOST_LISTED = 6
 
 def effect_sentence(effect: Effect) -> str:
     """An effect in one or two sentences."""
-    parts = [_verdict(effect), _lost(effect), _silent(effect), disturbed_words(effect.disturbed)]
+    left_out = disturbed_words(effect.disturbed, effect.quantity)
+    parts = [_verdict(effect), _lost(effect), _silent(effect), left_out]
     if effect.truths_differ:
         parts.append("The factor changes the truth itself, so the two were scored against different pictures.")
     return " ".join(part for part in parts if part)
 
 
-def disturbed_words(count: int) -> str:
-    """How many fits' times are left out of comparisons, in a sentence; empty for none."""
-    return f"Times of {count} {'fit' if count == 1 else 'fits'} are left out: their clocks were disturbed." if count else ""
+def disturbed_words(count: int, quantity: MeasuredQuantity) -> str:
+    """How many fits are left out of comparisons in a quantity, in a sentence; empty for none."""
+    fits = f"{count} {'fit' if count == 1 else 'fits'}"
+    if not count:
+        return ""
+    if quantity.key in TIMES:
+        return f"Times of {fits} are left out: their clocks were disturbed."
+    return f"Left out {'is' if count == 1 else 'are'} {fits} with less processor time than others in equal seconds."
 
 
 def unscored_sentences(metric: str, shown: MeasuredQuantity | None) -> list[str]:

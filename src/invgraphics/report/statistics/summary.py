@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.statistics.clocks import Speeds
+from invgraphics.report.statistics.clocks import Speeds, short_of_time
 from invgraphics.report.statistics.intervals import mean_half_width
 from invgraphics.report.statistics.leaders import leaders
 from invgraphics.report.statistics.values import value_of, without_score
@@ -56,6 +56,7 @@ class Row:
         complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
             missing makes a mean look better than it is.
         disturbed: why its times are not ranked: what is wrong with the clock of its fits; empty where nothing is.
+        slowed: whether one of its fits was `short_of_time`: its quality is not ranked either.
         lost: keys of the columns in which one of its fits diverged, or alone has no value; the others are not ranked either.
     """
 
@@ -67,11 +68,13 @@ class Row:
     cells: tuple[Cell, ...]
     complete: bool = True
     disturbed: str = ""
+    slowed: bool = False
     lost: frozenset[str] = frozenset()
 
     def ranked_in(self, column: MeasuredQuantity) -> bool:
-        """Whether it is ranked in a column: it lacks no seed and no seed's value, and for times no clock was disturbed."""
-        return self.complete and column.key not in self.lost and not (self.disturbed and column.key in TIMES)
+        """Whether it is ranked in a column: it lacks no seed and no seed's value, and no fit was disturbed in what counts."""
+        disturbed = (self.disturbed and column.key in TIMES) or (self.slowed and column.group != "cost")
+        return self.complete and column.key not in self.lost and not disturbed
 
 
 @dataclass(frozen=True)
@@ -117,8 +120,12 @@ class Summary:
 
     @property
     def disturbances(self) -> tuple[str, ...]:
-        """A sentence for each method whose times are not ranked."""
-        return tuple(f"The times of {row.label} are not ranked: {row.disturbed}." for row in self.methods if row.disturbed)
+        """A sentence for each method whose times, or quality too, are not ranked."""
+        return tuple(
+            f"The times {'and the quality ' if row.slowed else ''}of {row.label} are not ranked: {row.disturbed}."
+            for row in self.methods
+            if row.disturbed
+        )
 
     @property
     def baselines(self) -> tuple[Row, ...]:
@@ -136,14 +143,16 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
     columns = table_columns(comparison)
     absences: dict[str, list[str]] = {}
     rows = []
-    speeds = Speeds.of(comparison.runs)
+    speeds, short = Speeds.of(comparison.runs), set(map(id, short_of_time(comparison.runs)))
     most = max((len(comparison.runs_of(method)) for method in comparison.methods), default=0)
     for series, method in enumerate(comparison.methods):
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
         cells = tuple(_method_cell(column, runs, absences) for column in columns)
         kind: Literal["method", "failed"] = "method" if runs else "failed"
         lost = frozenset(column.key for column in columns if without_score(runs, column))
-        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, _disturbed(runs, speeds), lost))
+        disturbed, slowed = _disturbed(runs, speeds), any(id(run) in short for run in runs)
+        complete = len(runs) == most
+        rows.append(Row(method, kind, series, len(runs), failures, cells, complete, disturbed, slowed, lost))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
         rows.append(Row(name, "baseline", -1, 1, (), cells))
@@ -152,9 +161,10 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
 
 
 def quality_columns(comparison: Comparison) -> tuple[MeasuredQuantity, ...]:
-    """Quality metrics that at least one run or baseline has, in order of first appearance."""
+    """Quality metrics that at least one run or baseline has, the headline first, in the order of the one that has most."""
     found: dict[str, Score] = {}
-    for quality in [run.scores.quality for run in comparison.runs] + list(comparison.baselines.values()):
+    scored = [run.scores.quality for run in comparison.runs] + list(comparison.baselines.values())
+    for quality in sorted(scored, key=len, reverse=True):
         for key, score in quality.items():
             found.setdefault(key, score)
     return tuple(quality_quantity(key, score) for key, score in found.items())

@@ -62,7 +62,7 @@ def _quality(comparison: Comparison, summary: Summary) -> list[str]:
         gaps.append((abs(comparison.noise_ceiling - value), name))
     worded = [f"{column.text(gap)}{unit} {where}" for gap, where in gaps]
     sentence += f": {listing(worded)}." if worded and math.isfinite(value) else "."
-    return [sentence, _resolution(comparison, column, ranking), _other_metrics(summary, columns[1:], winner)]
+    return [sentence, _resolution(comparison, summary, column, ranking), _other_metrics(summary, columns[1:], winner)]
 
 
 def _best_baseline(summary: Summary, column: MeasuredQuantity) -> tuple[float, Row] | None:
@@ -74,7 +74,7 @@ def _one_seed(ranking: list[tuple[float, Row]]) -> bool:
     return max(row.seeds for _, row in ranking) < 2
 
 
-def _resolution(comparison: Comparison, column: MeasuredQuantity, ranking: list[tuple[float, Row]]) -> str:
+def _resolution(comparison: Comparison, summary: Summary, column: MeasuredQuantity, ranking: list[tuple[float, Row]]) -> str:
     """Sentence on the interval of the first method's lead over the second, and its significance over seeds."""
     if len(ranking) < 2:
         return ""
@@ -89,7 +89,10 @@ def _resolution(comparison: Comparison, column: MeasuredQuantity, ranking: list[
     size = f"{lead.estimate.size[0].upper()}{lead.estimate.size[1:]}"
     low, high = sorted((abs(lead.estimate.low), abs(lead.estimate.high)))
     if lead.found:
-        return f"Over {lead.estimate.size} that lead lies in [{lead.text(low)}, {lead.text(high)}]{unit} (95% interval)."
+        sentence = f"Over {lead.estimate.size} that lead lies in [{lead.text(low)}, {lead.text(high)}]{unit} (95% interval"
+        if (cell := summary.cell(ranking[0][1], column.key)) and cell.best:
+            return f"{sentence})."
+        return f"{sentence} of this pair alone; that it leads all others is not beyond chance, corrected for all columns)."
     # Any of the others could have come second, and the closest is chosen after the fact (Bonferroni over them).
     chosen = math.inf if lead.equivalence is None else lead.equivalence * (len(ranking) - 1)
     if lead.equivalent and chosen <= ALPHA and column.margin is not None:

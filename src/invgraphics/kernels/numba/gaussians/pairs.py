@@ -18,6 +18,7 @@ RAYS_PER_CELL = 8
 STEEPEST = 0.2
 """Least cosine between a ray and the mean of its group for which there is a tangent plane; other groups test all pairs."""
 _EIGHT, _ONE = np.float32(MAX_DEVIATIONS), np.float32(1.0)
+_ROUNDING = np.float32(4e-7)  # of a difference of two products, in units of either
 
 
 @inlined
@@ -42,10 +43,12 @@ def restrict(table, g, ox, oy, oz, dx, dy, dz):
 
 @inlined
 def _bound(a, b, c):
-    """Roots of ``a x² - 2 b x + c``, a > 0: bounds of the projection on one axis, widened for rounding."""
-    root = np.sqrt(max(b * b - a * c, np.float32(0.0)))
-    slack = np.float32(1e-4) * root + np.float32(1e-6)
-    return (b - root) / a - slack, (b + root) / a + slack
+    """Roots of ``a x² - 2 b x + c``, a > 0: bounds of the projection on one axis, widened for rounding.
+
+    Of a Gaussian that is small beside its distance, ``b² - a c`` is what rounding leaves of two numbers that are nearly equal.
+    """
+    root = np.sqrt(max(b * b - a * c, np.float32(0.0)) + _ROUNDING * b * b) * np.float32(1.0001)
+    return (b - root) / a - np.float32(1e-6), (b + root) / a + np.float32(1e-6)
 
 
 @parallel
