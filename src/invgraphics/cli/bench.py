@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 class Bench:
     """Measure every kernel against the plain reference and against the machine's limits, in one run; write tables and a page.
 
-    Ratios are taken within the run, those to the reference, limits and peers from calls in alternation; close other programs for
-    times that mean something.
+    Ratios are taken within the run, those to the reference, limits and peers from calls in alternation; close other programs
+    for times that mean something.
     """
 
     quick: bool = False

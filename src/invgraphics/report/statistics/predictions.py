@@ -90,7 +90,7 @@ def judge_predictions(
     lost: Iterable[Lost] = (),
     scenes: Sequence[str] = (),
 ) -> list[JudgedPrediction]:
-    """Judge each prediction by a study's finished runs and failed fits, those without scenes of their own on all of its scenes."""
+    """Judge each prediction by a study's finished runs and failed fits, those without scenes on all of its own."""
     failures, known = list(lost), tuple(dict.fromkeys([*scenes, *(one.scene for one in observations)]))
     return [_judge(prediction, observations, failures, prediction.scenes or known) for prediction in predictions]
 
