@@ -18,9 +18,10 @@ from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.scenes.photos import PhotoJob, attempts, reconstruct, sfm
 from invgraphics.scenes.photos.attempts import choice, try_all_pairs, try_strategies
 from invgraphics.scenes.photos.mapping import Matched
-from invgraphics.scenes.photos.outlier_cameras import isolation, remove_outlier_cameras
+from invgraphics.scenes.photos.outlier_cameras import FAR, isolation, remove_outlier_cameras
 from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
 from invgraphics.scenes.photos.prepare import Prepared
+from invgraphics.scenes.photos.quality import registration_obstacle, unplaced
 from invgraphics.scenes.photos.strategies import WIDE_ANGLE, Strategy, strategies
 
 COUNT = 10
@@ -281,6 +282,42 @@ def test_a_walk_has_no_outliers() -> None:
     """Steps of one to three metres, then a look from ten metres away."""
     places = np.cumsum([1.0, 2, 3, 1, 2, 3, 1, 2, 3, 10])
     assert isolation(np.column_stack([places, 0 * places, 0 * places])).max() == pytest.approx(10 / 3)
+
+
+def test_near_duplicates_isolate_no_other_camera() -> None:
+    """Stations 0.4 m apart, all but two photographed twice, and a film beside stills: nothing there is an outlier."""
+    generator = np.random.default_rng(0)
+    stations = np.column_stack([0.4 * np.arange(31), np.zeros((31, 2))])
+    bursts = np.concatenate([stations, stations[1:-1] + 0.01 * generator.normal(size=(29, 3)) / 3**0.5])
+    assert isolation(bursts).max() < FAR
+    angle = np.linspace(0, 2, 200)
+    film = 1.5 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    stills = 2.0 * np.column_stack([np.cos(angle[::17]), np.sin(angle[::17]), 0 * angle[::17]])
+    assert isolation(np.concatenate([film, stills])).max() < FAR
+    assert isolation(np.concatenate([film, [[9.0, 0, 0]]])).max() > FAR
+
+
+def test_a_film_is_not_taken_from_one_place() -> None:
+    """Most pairs of a film are of neighbouring frames, which move by a few pixels; frames far apart move by hundreds."""
+    photos = [SimpleNamespace(width=1600, height=900, name=str(index)) for index in range(300)]
+    apart = [(first, first + step) for step in (1, 2, 4, 8, 64, 256) for first in range(300 - step)]
+
+    def evidence(per_frame: float) -> VerifiedMatches:
+        pairs = [SimpleNamespace(first=a, second=b, motion=per_frame * (b - a)) for a, b in apart]
+        return VerifiedMatches((5000,) * 300, tuple(pairs))
+
+    assert registration_obstacle(photos, evidence(1.4)) is None
+    assert "one and the same place" in registration_obstacle(photos, evidence(0.01))[0]
+
+
+def test_photographs_of_another_piece_are_told_of_it() -> None:
+    photos = [SimpleNamespace(name=str(index), source=f"{index}.jpg") for index in range(4)]
+    pairs = [SimpleNamespace(first=0, second=1, motion=50.0), SimpleNamespace(first=2, second=3, motion=50.0)]
+    images = {1: SimpleNamespace(name="2", has_pose=True), 2: SimpleNamespace(name="3", has_pose=True)}
+    piece = SimpleNamespace(images=images, num_reg_images=lambda: 2)
+    found = unplaced(photos, VerifiedMatches((5000,) * 4, tuple(pairs)), {"0", "1"}, {}, [piece])
+    assert set(found) == {"2.jpg", "3.jpg"}
+    assert all("a separate piece of 2 photographs" in why and "--matching exhaustive" in why for why in found.values())
 
 
 @pytest.mark.parametrize(("key", "suspicious"), [("consistency", True), ("consistency", False), ("suspicion", True)])

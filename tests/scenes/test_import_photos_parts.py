@@ -17,12 +17,12 @@ from dots import save
 from PIL import Image
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.photos import PhotoJob
+from invgraphics.scenes.photos import PhotoJob, job
 from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
 from invgraphics.scenes.photos.prepare import Preparation, prepare
 from invgraphics.scenes.photos.result import _move_points, max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
-from invgraphics.scenes.photos.sources import natural
+from invgraphics.scenes.photos.sources import find_sources, natural
 from invgraphics.scenes.pictures.lens import Lens, straighten
 from invgraphics.scenes.process import run_worker
 
@@ -166,6 +166,7 @@ def test_progress_is_reported_in_any_encoding(encoding: str) -> None:
     [
         ({"a.txt": b"x"}, "no photograph"),
         ({"below/a.png": b"x"}, "photographs in .*below: name that folder"),
+        ({"one/a.avif": b"x", "two/b.jpg": b"x"}, "photographs in .*one, .*two: name one of these folders, or put all"),
         ({"a.heic": b"\0\0\0\x18ftypheic"}, "decodes HEIC"),
         ({"a.jpg": b"broken", "b.jpg": b"broken too"}, "cannot be read as a picture"),
     ],
@@ -176,6 +177,42 @@ def test_folders_without_photographs(content: dict[str, bytes], expected: str, t
         (tmp_path / "photos" / name).write_bytes(data)
     with pytest.raises(InputError, match=expected):
         prepared(tmp_path / "photos", tmp_path)
+
+
+def test_photographs_in_folders_below_are_told_of(tmp_path: Path) -> None:
+    for seed, name in enumerate(("a.png", "b.png", "second camera/c.png")):
+        save(noise(seed, 64, 64), tmp_path / "photos" / name)
+    save(np.full((64, 64), 255, np.uint8), tmp_path / "photos/masks/a.png.png")
+    (tmp_path / "photos/notes").mkdir()
+    found = prepared(tmp_path / "photos", tmp_path)
+    assert [photo.source for photo in found.photos] == ["a.png", "b.png"]
+    assert found.skipped == {"second camera/": "a folder with photographs of its own; put all of them into one"}
+
+
+@pytest.mark.parametrize("kind", ["jpg", "webp"])
+def test_focal_lengths_of_files_that_colmap_cannot_read(kind: str, tmp_path: Path) -> None:
+    """A 26 mm equivalent, as telephones write it: 26 of the film's 36 mm; COLMAP, by the film's diagonal, has a little more."""
+    image = Image.fromarray(noise(0, 64, 48))
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 26
+    (tmp_path / "photos").mkdir()
+    for name in "ab":
+        image.save(tmp_path / "photos" / f"{name}.{kind}", exif=exif)
+    sources = find_sources(PhotoJob(str(tmp_path / "photos")), {})
+    assert [source.focal_share for source in sources] == [pytest.approx(26 / 36, rel=0.05)] * 2
+
+
+def test_a_decoder_that_is_installed_later_makes_another_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The advice for a HEIC file is to install one; what was imported without it is then made again."""
+    save(noise(0, 64, 64), tmp_path / "photos/a.png")
+    request = PhotoJob(str(tmp_path / "photos"))
+    before = request.key()
+    assert request.key() == before
+    known = {"pycolmap": "4", "pillow": "12", "pillow-heif": "1"}
+    monkeypatch.setattr(job, "version", known.__getitem__)
+    after = request.key()
+    monkeypatch.setitem(known, "pillow-heif", "2")
+    assert len({before, after, request.key()}) == 3
 
 
 def test_one_camera_cannot_have_two_sizes(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from invgraphics.scenes.mitsuba import gbuffer, stage
 from invgraphics.scenes.mitsuba.build.mesh import polygon
 from invgraphics.scenes.mitsuba.build.model import Ball, Fog, Model, Part
 from invgraphics.scenes.mitsuba.build.surfaces import matte, studio
+from invgraphics.scenes.mitsuba.gbuffer import sample_points
 
 CENTRE, RADIUS, FLOOR = (0.1, -0.2, 0.3), 0.5, -0.4
 
@@ -90,3 +91,16 @@ def test_rendered_fog_has_the_coverage_that_was_computed(camera, mitsuba, tmp_pa
     inner = np.abs(error[2:-2, 2:-2])
     assert np.abs(error.mean()) < 2e-3
     assert inner.mean() < 0.02  # noise of 256 samples, at most 0.03 per pixel, and less where all or nothing is covered
+
+
+def test_points_are_chosen_from_all_views_without_their_being_in_memory_together() -> None:
+    """The same points, in the same order, as of one list of all."""
+    generator = np.random.default_rng(0)
+    views = [generator.normal(size=(count, 3)) for count in (50, 0, 700, 31)]
+    chosen = sample_points([len(view) for view in views], 300, 5)
+    together = np.concatenate(views)[np.random.default_rng(5).permutation(781)[:300]]
+    apart = np.full((300, 3), np.nan)
+    for view, (places, points) in zip(views, chosen, strict=True):
+        apart[places] = view[points]
+    assert np.array_equal(apart, together)
+    assert sum(len(places) for places, _ in sample_points([3, 4], 300, 0)) == 7

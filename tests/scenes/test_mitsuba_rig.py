@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from invgraphics.errors import InputError
-from invgraphics.scenes.mitsuba.rig import SPLITS, cameras, make_rig
+from invgraphics.scenes.mitsuba.rig import SPLITS, _low_discrepancy, _shifts, cameras, make_rig
 from invgraphics.scenes.mitsuba.spec import description_path, names, read
 
 TABLES = {
@@ -26,6 +26,22 @@ def test_splits_share_no_camera(kind, seed):
     for first, second in combinations(SPLITS, 2):
         difference = (poses[first][:, None] - poses[second][None]).flatten(2).norm(dim=2)
         assert difference.min() > 1e-3
+
+
+@pytest.mark.parametrize("dimensions", [2, 5])
+def test_no_split_runs_beside_the_training_cameras(dimensions):
+    """Of one sequence and a random shift, a seed in three had every test camera within a third of the usual spacing of a
+    training camera, some within a thirteenth."""
+    first = _low_discrepancy(200, torch.zeros(dimensions, dtype=torch.float64))
+    spacing = torch.cdist(first, first).fill_diagonal_(9).min()
+    for seed in range(120):
+        train, *others = (_low_discrepancy(40, shift) for shift in _shifts(dimensions, seed))
+        for other in others:
+            apart = (train[:, None] - other[None]).abs()
+            assert float(torch.minimum(apart, 1 - apart).norm(dim=2).min()) > 0.3 * float(spacing)
+    assert torch.equal(
+        _shifts(dimensions, 0), torch.rand(3, dimensions, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    )
 
 
 @pytest.mark.parametrize("kind", TABLES)

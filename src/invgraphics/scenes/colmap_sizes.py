@@ -133,7 +133,7 @@ def _parameter_counts() -> dict[int, int]:
 
 
 def names_in_text(path: Path) -> dict[int, str]:
-    """Names of an ``images.txt``'s images by their numbers, with the spaces at which COLMAP cuts them; none beside a binary.
+    """Names with spaces, at which COLMAP cuts them, of an ``images.txt``'s images by their numbers; none beside a binary.
 
     Each image has a second line, of points: COLMAP takes every second line for one.
 
@@ -152,8 +152,9 @@ def names_in_text(path: Path) -> dict[int, str]:
             sentence = f"{path} has no line of points after each image: '{last[0]}' follows another image at once."
             raise InputError(sentence, "Add an empty line after each image, as COLMAP writes it.")
         match line.split(maxsplit=_BEFORE_NAME):
-            case [number, *rest] if number.isdecimal() and len(number) <= _DIGITS and len(rest) == _BEFORE_NAME:
-                names[int(number)] = rest[-1].rstrip()
+            case [number, *rest] if number.isdecimal() and len(number) <= _DIGITS and len(rest[_BEFORE_NAME - 1 :]) == 1:
+                if len(rest[-1].split()) > 1:
+                    names[int(number)] = rest[-1].rstrip()
     return names
 
 

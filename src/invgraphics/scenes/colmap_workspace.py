@@ -119,8 +119,9 @@ def _read(folder: Path, given: Path) -> Model:
         reconstruction = pycolmap.Reconstruction(str(folder))
     except (ValueError, IndexError, RuntimeError, MemoryError) as error:
         raise InputError(f"The COLMAP model {folder} cannot be read: {str(error).splitlines()[0]}.") from error
-    for number, image in reconstruction.images.items():
-        image.name = names_of.get(number, image.name)
+    for number, name in names_of.items():
+        if number in reconstruction.images:
+            reconstruction.images[number].name = name
     bare = Model(folder, reconstruction, None, 0)
     try:
         names = [image.name for image in bare.registered]

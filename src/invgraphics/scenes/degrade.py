@@ -77,7 +77,7 @@ class TrainingData:
 
     @property
     def changes_photographs(self) -> bool:
-        """Whether photographs are left out or changed, so that points made from all of them know too much.
+        """Whether photographs are left out or changed, so that points made from all of them would leak what is withheld.
 
         Disturbed poses do not count: points triangulated at wrong poses, or random ones, start no refinement of poses.
         """

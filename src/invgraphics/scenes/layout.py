@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -47,6 +47,7 @@ class SceneOptions:
 
     size: int | tuple[int, int] | None = None
     test_views: int | None = 16
+    _: KW_ONLY
     train_views: int | None = None
     seed: int = 0
     spp: int | None = None

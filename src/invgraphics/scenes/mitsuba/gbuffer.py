@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,10 +95,19 @@ def first_hits(
     return np.where(valid, np.array(hit.t, dtype=np.float64), np.inf), np.array(hit.n, dtype=np.float64).T
 
 
-def sample_points(
-    positions: list[Float[np.ndarray, "n 3"]], colours: list[Float[np.ndarray, "n 3"]], count: int, seed: int
-) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-    """At most ``count`` of the surface points that the views see, without repetition, and their colours."""
-    position, colour = np.concatenate(positions), np.concatenate(colours)
-    chosen: Int[np.ndarray, " p"] = np.random.default_rng(seed).permutation(len(position))[:count]
-    return position[chosen], colour[chosen]
+def sample_points(counts: Sequence[int], most: int, seed: int) -> list[tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]]:
+    """Choose at most ``most`` of the surface points that views see, without repetition.
+
+    Args:
+        counts: points of each view.
+        most: how many in all.
+        seed: of the choice.
+
+    Returns:
+        For each view the places of its points among the chosen ones, and their numbers in the view.
+    """
+    chosen: Int[np.ndarray, " p"] = np.random.default_rng(seed).permutation(sum(counts))[:most]
+    ends = np.cumsum(counts)
+    view = np.searchsorted(ends, chosen, side="right")
+    places = [np.flatnonzero(view == index) for index in range(len(counts))]
+    return [(place, chosen[place] - (ends[index] - counts[index])) for index, place in enumerate(places)]

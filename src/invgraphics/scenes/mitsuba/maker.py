@@ -22,8 +22,8 @@ from invgraphics.scenes.process import Progress, run_worker
 
 FILM_BYTES = 44
 """Of a pixel while its view is rendered: colour, alpha, depth and normal, and their filter weights."""
-PICTURE_BYTES = 3
-"""Of a pixel of a view that is loaded: 8-bit colour."""
+PICTURE_BYTES = 20
+"""Of a pixel of a view that is loaded: colour and alpha of 8 bits, depth and normal of 32."""
 
 
 def make(

@@ -107,16 +107,18 @@ def _finish(job: Job, model: Model, folder: Path, views: dict[Split, tuple[Camer
 
 
 def _write_points(job: Job, folder: Path, train: tuple[Camera, ...]) -> None:
-    positions, colours = [], []
-    for index, camera in enumerate(train):
-        arrays = read_arrays(folders.view_paths(folder, "train", index)[1])
-        depth, linear = arrays["depth"].reshape(-1), arrays["linear"]
-        rays = camera.rays()
-        hit = np.isfinite(depth)
-        positions.append((rays.origins.numpy() + np.where(hit, depth, 0)[:, None] * rays.directions.numpy())[hit])
-        colours.append(folders.straight_srgb(linear)[..., :3].numpy().reshape(-1, 3)[hit])
-    position, rgb = sample_points(positions, colours, POINTS, job.seed)
-    write_arrays(folder / "points.npz", {"position": position.astype(np.float32), "rgb": rgb.astype(np.float32)})
+    """Write a random choice of the points that the training views see, one view in memory at a time."""
+    paths = [folders.view_paths(folder, "train", index)[1] for index in range(len(train))]
+    counts = [int(np.isfinite(read_arrays(path)["depth"]).sum()) for path in paths]
+    chosen = sample_points(counts, POINTS, job.seed)
+    position, rgb = (np.zeros((min(sum(counts), POINTS), 3), np.float32) for _ in range(2))
+    for path, camera, (places, points) in zip(paths, train, chosen, strict=True):
+        arrays, rays = read_arrays(path), camera.rays()
+        depth = arrays["depth"].reshape(-1)
+        pixel = np.flatnonzero(np.isfinite(depth))[points]
+        position[places] = rays.origins.numpy()[pixel] + depth[pixel, None] * rays.directions.numpy()[pixel]
+        rgb[places] = folders.straight_srgb(arrays["linear"])[..., :3].numpy().reshape(-1, 3)[pixel]
+    write_arrays(folder / "points.npz", {"position": position, "rgb": rgb})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Where cameras stand. Every split follows the same low-discrepancy sequence, shifted, so that no two share a camera."""
+"""Where cameras stand. Every split follows the same low-discrepancy sequence, shifted, so that no two share a camera.
+
+Shifts by which a whole split would run along beside the training cameras are drawn again (`_shifts`).
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,11 @@ from invgraphics.scenes.mitsuba.spec import Vector
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 UP = (0.0, 0.0, 1.0)
+LEAST_GAP, NEIGHBOURS = 0.35, 64
+"""Least distance in the unit cube of any camera of a split to one of the training cameras, as a share of the smallest distance
+of two cameras of one split at most so many numbers apart."""
+DRAWS = 100
+"""Shifts that are drawn at most; two of three have such a distance."""
 
 
 @dataclass(frozen=True)
@@ -153,9 +161,7 @@ def cameras(rig: Rig, split: Split, count: int, size: tuple[int, int], seed: int
     """
     width, height = size
     focal = 0.5 * min(size) / math.tan(math.radians(rig.fov) / 2)
-    generator = torch.Generator().manual_seed(seed)
-    shifts = torch.rand(len(SPLITS), rig.dimensions, generator=generator, dtype=torch.float64)
-    units = _low_discrepancy(count, shifts[SPLITS.index(split)])
+    units = _low_discrepancy(count, _shifts(rig.dimensions, seed)[SPLITS.index(split)])
     return tuple(
         Camera(rig.pose(unit), _tensor((focal, focal)), _tensor((width / 2, height / 2)), width, height) for unit in units
     )
@@ -163,12 +169,38 @@ def cameras(rig: Rig, split: Split, count: int, size: tuple[int, int], seed: int
 
 def _low_discrepancy(count: int, shift: Float[Tensor, " d"]) -> Float[Tensor, "n d"]:
     """Points of the unit cube by the additive recurrence R_d (Roberts 2018), whose prefixes are even too."""
-    dimensions = len(shift)
+    return (shift + torch.arange(1, count + 1, dtype=torch.float64)[:, None] * _steps(len(shift))) % 1.0
+
+
+def _steps(dimensions: int) -> Float[Tensor, " d"]:
+    """Difference of two successive points of the recurrence."""
     root = 2.0
     for _ in range(64):  # fixed point of x = (1 + x)^(1 / (d + 1)), the generalised golden ratio
         root = (1 + root) ** (1 / (dimensions + 1))
-    steps = torch.tensor([root ** -(axis + 1) for axis in range(dimensions)], dtype=torch.float64)
-    return (shift + torch.arange(1, count + 1, dtype=torch.float64)[:, None] * steps) % 1.0
+    return torch.tensor([root ** -(axis + 1) for axis in range(dimensions)], dtype=torch.float64)
+
+
+def _shifts(dimensions: int, seed: int) -> Float[Tensor, "splits d"]:
+    """Random shift of each split's sequence, with a gap between the cameras of the first split and those of each other.
+
+    Two sequences differ by their shift alone, so that one that lies near a multiple of the step puts every camera of a split
+    beside a training camera, and scores it on views that are known.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    shifts = torch.rand(len(SPLITS), dimensions, generator=generator, dtype=torch.float64)
+    multiples = torch.arange(-NEIGHBOURS, NEIGHBOURS + 1, dtype=torch.float64)[:, None] * _steps(dimensions)
+    least = LEAST_GAP * _torus_norm(multiples[NEIGHBOURS + 1 :]).min()
+    for split in range(1, len(SPLITS)):
+        for _ in range(DRAWS):
+            if _torus_norm(shifts[split] - shifts[0] - multiples).min() >= least:
+                break
+            shifts[split] = torch.rand(dimensions, generator=generator, dtype=torch.float64)
+    return shifts
+
+
+def _torus_norm(difference: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
+    """Distance in the unit cube, whose opposite faces are one."""
+    return (difference - difference.round()).norm(dim=1)
 
 
 def _tensor(values: tuple[float, ...]) -> Tensor:

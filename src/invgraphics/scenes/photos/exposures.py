@@ -19,7 +19,7 @@ DARKEST, BRIGHTEST = 0.03, 0.97
 ALL = 0.999
 """Share of a pixel that must be opaque and not masked."""
 FEWEST_VIEWS = 3
-"""Fewest views of a point, so that one of them cannot speak for it."""
+"""Least track length of a point, so that its brightness is not that of a single view."""
 FEWEST_PIXELS = 20
 """Fewest pixels of a photograph with an estimated exposure."""
 REWEIGHTINGS = 10

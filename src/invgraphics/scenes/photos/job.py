@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -93,7 +93,7 @@ class PhotoJob:
         return fill(PhotoJob, parse_json(text, "the job"))
 
     def key(self) -> str:
-        """Hash of the settings, the photographs' names, sizes and dates, and the library's version.
+        """Hash of the settings, the photographs' names, sizes and dates, and the versions of COLMAP and of the decoders.
 
         Not of the folder's name, which may be spelled from anywhere.
         """
@@ -113,8 +113,16 @@ class PhotoJob:
     def _hash(self, settings: dict[str, Any]) -> str:
         files = [(path, path.stat()) for path in files_read(self.path)]
         listing = [(os.path.relpath(path, self.path), state.st_size, state.st_mtime_ns) for path, state in files]
-        content = [SCHEMA, settings, listing, version("pycolmap")]
+        content = [SCHEMA, settings, listing, *map(_version, ("pycolmap", "pillow", "pillow-heif"))]
         return sha256_of(content)[:16]
+
+
+def _version(package: str) -> str | None:
+    """Version of an installed package; ``None`` without it."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def files_read(folder: Path) -> list[Path]:

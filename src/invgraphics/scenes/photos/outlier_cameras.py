@@ -19,7 +19,11 @@ FEW_POINTS = 15
 """Fewest observations of a camera that is kept: COLMAP accepts no pair of photographs with fewer verified matches."""
 
 FAR = 10.0
-"""Distance to the nearest neighbour, in units of the 90 % quantile of these distances, from which a camera is an outlier."""
+"""`isolation` from which a camera is an outlier."""
+
+SPREAD_SHARE = 0.05
+"""Of the cameras' distances from their middle, to which distances of near-duplicates (bursts, frames of a film) are nothing: a
+camera is not isolated for lying between clusters of these."""
 
 MOST = 1 / 3
 """Largest share of the cameras that may be outliers: beyond, the whole reconstruction is weak, and stays as it is."""
@@ -80,10 +84,15 @@ def remove_uncorrectable_cameras(model: Any, photos: Sequence[Prepared]) -> dict
 
 
 def isolation(centres: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Distance of each camera to its nearest neighbour, in units of the 90 % quantile of these distances."""
+    """Distance of each camera to its nearest neighbour, in units of the 90 % quantile of these distances.
+
+    The unit is at least `SPREAD_SHARE` of the 90 % quantile of the cameras' distances from their median position.
+    """
     if len(centres) < 3:
         return np.zeros(len(centres))
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     np.fill_diagonal(distance, np.inf)
     nearest = distance.min(axis=1)
-    return nearest / max(float(np.quantile(nearest, _QUANTILE, method="lower")), 1e-12)
+    spread = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    usual, wide = (float(np.quantile(values, _QUANTILE, method="lower")) for values in (nearest, spread))
+    return nearest / max(usual, SPREAD_SHARE * wide, 1e-12)

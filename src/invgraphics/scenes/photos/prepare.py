@@ -18,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.files import write_picture, write_text
 from invgraphics.scenes.photos.job import PhotoJob
 from invgraphics.scenes.photos.sources import Source, find_sources, readable
-from invgraphics.scenes.pictures.images import PHONE, image_files
+from invgraphics.scenes.pictures.images import PHONE, has_photographs
 from invgraphics.scenes.pictures.views import make_view
 from invgraphics.scenes.process import Progress
 from invgraphics.tables import read_json
@@ -182,7 +182,7 @@ def _mask(source: Source, whole: UInt8[np.ndarray, "h w c"], pixels: np.ndarray)
 
 def _reason(name: str, error: InputError) -> str:
     suffix = Path(name).suffix.lower()
-    if suffix in PHONE:
+    if suffix in PHONE and "cannot be read as a picture" in error.sentence:
         return f"nothing here decodes {suffix[1:].upper()}; convert it to JPEG, or `pip install pillow-heif`"
     return readable(error.sentence).rstrip(".")
 
@@ -203,7 +203,8 @@ def _refuse(folder: Path, photos: list[Prepared], skipped: dict[str, str]) -> No
         name, why = next(iter(skipped.items()))
         more = f" ({len(skipped)} files are left out)" if len(skipped) > 1 else ""
         raise InputError(f"{folder} has {what} that can be used; {name}: {why}{more}.", ADVICE)
-    below = next((path for path in sorted(folder.iterdir()) if image_files(path)), None)
-    raise InputError(
-        f"{folder} has {what}.", ADVICE if below is None else f"There are photographs in {below}: name that folder."
-    )
+    below = [str(path) for path in sorted(folder.iterdir()) if has_photographs(path)]
+    remedy = f"There are photographs in {below[0]}: name that folder." if below else ADVICE
+    if len(below) > 1:
+        remedy = f"There are photographs in {', '.join(below)}: name one of these folders, or put all photographs into one."
+    raise InputError(f"{folder} has {what}.", remedy)

@@ -17,7 +17,7 @@ FEW_FEATURES = 200
 """A sharp photograph of a textured scene has thousands of SIFT features; below this one there is little to hold on to."""
 
 NO_MOTION = 0.01
-"""Median motion of matches, as a share of the longest side, below which a pair shows no parallax worth the name."""
+"""Motion of matches, as a share of the longest side, below which a pair shows no parallax worth the name."""
 
 
 def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:
@@ -53,9 +53,22 @@ EMPTY_FIGURES: dict[str, Any] = {
 
 
 def unplaced(
-    photos: Sequence[Prepared], evidence: VerifiedMatches, placed: set[str], outliers: Mapping[str, str]
+    photos: Sequence[Prepared],
+    evidence: VerifiedMatches,
+    placed: set[str],
+    outliers: Mapping[str, str],
+    pieces: Sequence[Any] = (),
 ) -> dict[str, str]:
-    """Photograph -> why it has no pose."""
+    """Photograph -> why it has no pose.
+
+    Args:
+        photos: all of them.
+        evidence: their matches.
+        placed: names of those with a pose.
+        outliers: photograph -> why its camera was removed.
+        pieces: other reconstructions, apart from the one that is kept.
+    """
+    elsewhere = {image.name: model.num_reg_images() for model in pieces for image in model.images.values() if image.has_pose}
     reasons = {}
     for index, photo in enumerate(photos):
         if photo.name in placed:
@@ -65,6 +78,9 @@ def unplaced(
             reasons[photo.source] = outliers[photo.source]
         elif features < FEW_FEATURES:
             reasons[photo.source] = f"only {features} features: blurred, or it shows something bare"
+        elif photo.name in elsewhere:
+            piece = f"in a separate piece of {elsewhere[photo.name]} photographs, which shares too few matches with this one"
+            reasons[photo.source] = f"{piece}; --matching exhaustive, or photographs between the two, may join them"
         elif not partners:
             reasons[photo.source] = "shares nothing with any other photograph"
         else:
@@ -87,7 +103,7 @@ def registration_obstacle(photos: Sequence[Prepared], evidence: VerifiedMatches)
     """Why no strategy can register these photographs, and a remedy; ``None`` where one may."""
     longest = max(max(photo.width, photo.height) for photo in photos)
     features = float(np.median(evidence.features))
-    motions = [pair.motion for pair in evidence.pairs]
+    motions = _largest_motions(evidence)
     if features < FEW_FEATURES:
         remedy = "Take sharp photographs of something with texture, in better light; or give a larger --max-size."
         return f"they show too little to recognise ({features:.0f} features each, blurred or bare).", remedy
@@ -97,6 +113,15 @@ def registration_obstacle(photos: Sequence[Prepared], evidence: VerifiedMatches)
     if len(evidence.pairs) < len(photos) - 1:
         return f"they hardly overlap ({len(evidence.pairs)} pairs of them show a common part).", ADVICE
     return None
+
+
+def _largest_motions(evidence: VerifiedMatches) -> list[float]:
+    """Of each photograph with matches the largest motion to another: neighbours in a film have moved next to nothing."""
+    largest: dict[int, float] = {}
+    for pair in evidence.pairs:
+        for index in (pair.first, pair.second):
+            largest[index] = max(largest.get(index, 0.0), pair.motion)
+    return list(largest.values())
 
 
 def refusal(photos: Sequence[Prepared], evidence: VerifiedMatches, registered: int) -> tuple[str, str] | None:

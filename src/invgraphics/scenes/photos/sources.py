@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
 from invgraphics.scenes.pictures import png
-from invgraphics.scenes.pictures.images import PHONE, RAW, SUFFIXES, UNREADABLE, image_files, read_pixels
+from invgraphics.scenes.pictures.images import PHONE, RAW, SUFFIXES, UNREADABLE, has_photographs, image_files, read_pixels
 from invgraphics.scenes.pictures.masks import mask_of, masks_folder, read_upright_mask
 
 FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
@@ -72,11 +73,15 @@ def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
             group = "/".join(str(exif.get(tag, "")) for tag in _LENS_TAGS)
             mask = None if masks is None else mask_of(path.name, masks)
             read = None if mask is None else partial(read_upright_mask, mask, path)
-            found.append(Source(readable(path.name), partial(read_pixels, path), group, _focal_share(path), mask=read))
+            found.append(Source(readable(path.name), partial(read_pixels, path), group, _focal_share(path, exif), mask=read))
+    for path in sorted(folder.iterdir()) if found else ():
+        if path != masks and has_photographs(path):
+            skipped[f"{readable(path.name)}/"] = "a folder with photographs of its own; put all of them into one"
     return found
 
 
-_LENS_TAGS = (0x010F, 0x0110, 0x920A, 0xA405, 0xA434)  # make, model, focal length, its 35 mm equivalent, lens
+_FOCAL_35MM = 0xA405
+_LENS_TAGS = (0x010F, 0x0110, 0x920A, _FOCAL_35MM, 0xA434)  # make, model, focal length, its 35 mm equivalent, lens
 
 
 def _exif(path: Path) -> dict[int, Any]:
@@ -92,16 +97,27 @@ def _exif(path: Path) -> dict[int, Any]:
         return {}
 
 
-def _focal_share(path: Path) -> float | None:
-    """Focal length over the longest side, as COLMAP reads it from EXIF (35 mm equivalent, focal plane, sensor data base)."""
+def _focal_share(path: Path, exif: Mapping[int, Any]) -> float | None:
+    """Focal length over the longest side, as COLMAP reads it from EXIF (35 mm equivalent, focal plane, sensor data base).
+
+    Of files in which COLMAP finds none (HEIC, AVIF, WebP, which only Pillow decodes), by the 35 mm equivalent over the film's
+    width of 36 mm.
+    """
     from invgraphics.scenes.colmap_library import pycolmap
 
-    try:
+    share = _number(exif.get(_FOCAL_35MM)) / 36
+    with suppress(ValueError, RuntimeError):
         camera = pycolmap.infer_camera_from_image(str(path))
-    except (ValueError, RuntimeError):
-        return None
-    share = camera.mean_focal_length() / max(camera.width, camera.height)
-    return share if camera.has_prior_focal_length and FOCAL_RANGE[0] < share < FOCAL_RANGE[1] else None
+        if camera.has_prior_focal_length:
+            share = camera.mean_focal_length() / max(camera.width, camera.height)
+    return share if FOCAL_RANGE[0] < share < FOCAL_RANGE[1] else None
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
 
 
 def _register_decoders() -> None:

@@ -95,7 +95,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         top_view(best.pieces[0], title, result / TOP_VIEW)
         bend = write_scene(best.pieces[0], photos, matched.work, result, clock.show)
     clock.start("")
-    refused = refusal(photos, matched.evidence, figures["registered"])
+    refused, placed = refusal(photos, matched.evidence, figures["registered"]), {one["name"] for one in figures["cameras"]}
     return {
         "job": parse_json(job.text(), "the job"),
         "given": len(photos) + len(skipped),
@@ -108,7 +108,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         "usable": refused is None,
         "refusal": refused,
         "skipped": skipped,
-        "unplaced": unplaced(photos, matched.evidence, {camera["name"] for camera in figures["cameras"]}, best.outliers),
+        "unplaced": unplaced(photos, matched.evidence, placed, best.outliers, best.pieces[1:]),
         "seconds": clock.seconds,
     }
 

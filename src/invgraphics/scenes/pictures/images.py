@@ -70,6 +70,15 @@ def image_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith("._"))
 
 
+def has_photographs(folder: Path) -> bool:
+    """Whether there are photographs directly in ``folder``, in formats of telephones too; not, if it may not be looked into."""
+    try:
+        names = [one.name for one in folder.iterdir()] if folder.is_dir() else []
+    except OSError:
+        return False
+    return any(name.lower().endswith(SUFFIXES + PHONE) and not name.startswith(".") for name in names)
+
+
 def file_exists(path: Path) -> bool:
     """Whether a file exists; ``False`` for names that the file system does not take, which `Path.is_file` raises about."""
     return os.path.isfile(path)  # noqa: PTH113
