@@ -62,7 +62,7 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     began = time.monotonic()
     request, choice, opened = (request, "", None) if request.methods else _choose_methods(request)
     if opened is None and any_finished(request):
-        opened = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, request.spp))
+        opened = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, spp=request.spp))
     request, jobs, scenes, refused = _resolve(request, opened)
     folder = RunFolder(Path(request.out))
     failures: list[Failure] = []
@@ -98,7 +98,7 @@ def _choose_methods(request: CompareRequest) -> tuple[CompareRequest, str, Scene
     Raises:
         InputError: the scene cannot be opened.
     """
-    scene = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, request.spp))
+    scene = open_with_progress(request.scene, SceneOptions(request.size, request.test_views, spp=request.spp))
     methods, reason = default_methods(scene)
     print(f"Methods: {', '.join(methods)}, chosen for {reason}; --methods overrides.{space_note(scene)}", file=sys.stderr)
     return replace(request, methods=methods), f"chosen for {reason}", scene
