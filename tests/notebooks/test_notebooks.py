@@ -1,6 +1,7 @@
 """Every notebook runs at a small size, and what it prints in numbers holds."""
 
 import importlib.util
+import itertools
 import json
 import math
 import re
@@ -261,6 +262,14 @@ def _ewa(out: _Printed) -> None:
     assert line == pytest.approx(predicted, rel=1e-4)
     assert out.numbers("exact line integral: at most")[0] < 0.03
     assert out.numbers("differs from V_hat + 0.3 I by")[0] < 1e-9
+    # Integrals of max(0, x) times Legendre polynomials over [0, 1] are 1/2, 1/3, 1/8 and 0 (Ramamoorthi and Hanrahan 2001).
+    held = [
+        0.0,
+        *itertools.accumulate((2 * band + 1) * integral**2 / 4 for band, integral in ((1, 1 / 3), (2, 1 / 8), (3, 0.0))),
+    ]
+    matte = out.numbers("highlight of exponent 1: degree 0 leaves", ", 1", ", 2", ", 3")
+    assert matte == pytest.approx([math.sqrt(1 - part / (1 / 6 - 1 / 4**2)) for part in held], abs=0.01)
+    assert out.numbers("highlight of exponent 100: degree 0 leaves", ", 1", ", 2", ", 3")[3] > 0.8
 
 
 def _splatting(out: _Printed) -> None:
