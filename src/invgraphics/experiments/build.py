@@ -123,5 +123,6 @@ def configure_torch(device: torch.device) -> None:
     Threads of torch's and Numba's pools follow if they start later: all of them, unless torch has computed here before.
     """
     torch.set_deterministic_debug_mode("warn" if device.type == "cpu" else "default")
+    torch.backends.cudnn.allow_tf32 = False  # of SSIM's variances, differences of two convolutions, 10 bits leave nothing
     torch.utils.deterministic.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]  # a debugging aid, slow
     torch.set_flush_denormal(True)

@@ -75,7 +75,9 @@ class MeshFieldConfig:
             mesh: Mesh = source.primitives(Quantity.MESH, Context(scene.bounds))
         elif (Quantity.SDF | Quantity.DENSITY) & source.provides:
             remedy = "Use --set field.level=LEVEL, or fit the run that the mesh is made of for longer."
-            mesh = extract_mesh(source, scene.bounds, self.resolution, self.level, remedy).mesh
+            device = next((tensor.device for tensor in (*source.parameters(), *source.buffers())), torch.device("cpu"))
+            bounds = scene.bounds.to(device)
+            mesh = extract_mesh(source, bounds, self.resolution, self.level, remedy).mesh
         else:
             remedy = "Export it with `invgraphics export RUN --to mesh` first, and give that file as field.source."
             raise InputError(f"field.source: {type(source).__name__} has no density whose surface could be extracted.", remedy)

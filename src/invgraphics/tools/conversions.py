@@ -156,7 +156,7 @@ def _calibrate(field: GaussianField, model: Model, scene: Scene, method: Method)
     cameras = [scene.train[i * len(scene.train) // count].camera for i in range(count)]
     background = scene.background
     truth = [model.render(camera, normals=False).over(background) for camera in cameras]
-    shown, widths = Model(field, method.recipe.renderer.build(scene), scene.bounds), field.log_scales.clone()
+    shown, widths = Model(field, method.recipe.renderer.build(scene), scene.bounds.to(model.device)), field.log_scales.clone()
 
     def error(spread: float, opacity: float) -> float:
         field.log_scales.copy_(widths + math.log(spread))

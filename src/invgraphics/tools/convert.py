@@ -165,6 +165,7 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
             test_views=options.test_views,
             spp=options.spp,
             seed=request.seed,
+            device="cuda" if fitted.model.device.type == "cuda" else None,
             kernels=request.kernels,
         )
     )

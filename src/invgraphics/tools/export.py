@@ -113,7 +113,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
 
     _, written = read_gaussians(request.out)
     back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, world).float())
-    loss = psnr_between(local, on_device(back, fitted.model.device), fitted)
+    loss = psnr_between(*(on_device(each, fitted.model.device) for each in (local, back)), fitted=fitted)
     degree = harmonics.degree_of(written.gaussians.sh.shape[1])
     had = harmonics.degree_of(local.sh.shape[1])
     return Exported(

@@ -181,7 +181,7 @@ class _InferenceMethods:
         yield NEAREST, lambda: self._nearest.find(views)
         if self._request.no_prior is not None:
             budget = Budget.parse(self._request.no_prior)
-            yield NO_PRIOR, lambda: without_prior(self._first.method, self.scene, views, budget)
+            yield NO_PRIOR, lambda: without_prior(self._first.method, self.scene, views, budget, self._first.model.device)
 
     def score(self, model: Model, views: Sequence[View], method: str, seconds: float) -> InstanceScores:
         """Scores of an instance on its test views, rounded to 8 bits as everywhere."""

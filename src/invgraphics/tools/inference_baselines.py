@@ -23,12 +23,12 @@ RAYS = 512
 """Of a step of a fit without a prior, which sees few pixels."""
 
 
-def without_prior(method: Method, scene: Scene, views: Sequence[View], budget: Budget, seed: int = 0) -> Model:
+def without_prior(method: Method, scene: Scene, views: Sequence[View], budget: Budget, device: torch.device) -> Model:
     """Fit the same field and renderer to an instance's views alone: a class of one, from scratch, its code without penalty."""
     batches = replace(method.recipe.batches, rays=min(method.recipe.batches.rays, RAYS))
     few = replace(method, recipe=replace(method.recipe, batches=batches, penalties=()))
     alone = replace(scene, train=tuple(views), val=(), observed=())
-    fit = Fit(build_plan(few, alone, budget, seed, torch.device("cpu")))
+    fit = Fit(build_plan(few, alone, budget, 0, device))
     fit.run(lambda loss: False)
     return fit.model
 

@@ -64,7 +64,9 @@ def planes_of(fitted: Fitted, request: ExportRequest) -> tuple[Planes, str]:
             sentence = f"The model of '{request.run}' ({fitted.method.name}) has planes of its own."
             raise InputError(sentence, f"Leave {' and '.join(idle)} out.")
         with torch.no_grad():
-            return model.field.primitives(Quantity.PLANES, model.context()), "the run's own planes"
+            own: Planes = model.field.primitives(Quantity.PLANES, model.context())
+        stored = {name: getattr(own, name).cpu() for name in ("depths", "rgb", "alpha")}
+        return replace(own, camera=own.camera.to("cpu"), **stored), "the run's own planes"
     if Quantity.DENSITY | Quantity.RADIANCE not in model.field.provides:
         raise InputError(
             f"The model of '{request.run}' ({fitted.method.name}) has no density that could be sliced.",

@@ -2,6 +2,9 @@
 
 Other operations fall back to the reference, which runs on any device. Gradients of hash tables, lattices and splats are
 accumulated atomically, in no fixed order: repeated runs agree to rounding, not bitwise.
+
+Numbers that change from step to step (of points, rows, pixels) are in ``do_not_specialize``: Triton would compile a kernel
+again where they become divisible by 16, on the clock of a fit.
 """
 
 from invgraphics.kernels.cuda.composite import composite as composite

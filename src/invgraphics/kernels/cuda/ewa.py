@@ -97,7 +97,7 @@ def area_of(x0, x1, x2, y0, y1, y2):
     return c0 * c0 + c1 * c1 + c2 * c2
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n"])
 def project(
     means, quaternions, scales, opacities, sh, view, n, width, height, dilation,
     means2d, conics, depths, planes, radii, rgb, compensations,

@@ -114,7 +114,7 @@ def _pose_backward(
     tl.store(pose + 11, -_total(visible, world_z))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n"])
 def project_backward(
     means, quaternions, scales, sh, view, conics, radii, rgb, n, width, height, dilation,
     grad_means2d, grad_conics, grad_depths, grad_rgb, grad_compensations,

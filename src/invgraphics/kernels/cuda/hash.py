@@ -46,7 +46,7 @@ def _entry(x, y, z, edge, mask):
     return tl.where(mask == 0, dense, (hashed & mask.to(tl.uint32)).to(tl.int32))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["points"])
 def encode(unit, table, levels, out, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr):
     """Features of one level at a block of points. ``levels`` holds cells, offsets and masks, ``count`` of each."""
     level = tl.program_id(1)
@@ -66,7 +66,7 @@ def encode(unit, table, levels, out, points, count, FEATURES: tl.constexpr, WIDT
     tl.store(out + (point * count + level)[:, None] * FEATURES + column[None, :], total, mask=valid)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["points"])
 def encode_backward(
     unit, gradient, levels, grad_table, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
 ):
@@ -87,7 +87,7 @@ def encode_backward(
         tl.atomic_add(grad_table + row[:, None] + column[None, :], weight[:, None] * cotangent, mask=valid)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["points"])
 def position_gradient(
     unit, table, gradient, levels, grad_unit, points, count, FEATURES: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr
 ):

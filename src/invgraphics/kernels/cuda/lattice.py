@@ -63,7 +63,7 @@ def _row(x, y, z, links, counts, rows, in_range, LINKED: tl.constexpr):
     return index, there
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["points", "rows"])
 def encode(
     unit, features, links, columns, counts, out, points, rows, channels,
     AXES: tl.constexpr, LINKED: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr,
@@ -82,7 +82,7 @@ def encode(
     tl.store(out + point[:, None] * channels + channel[None, :], total, mask=in_range[:, None] & (channel < channels)[None, :])
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["points", "rows"])
 def encode_backward(
     unit, features, links, columns, counts, gradient, grad_unit, grad_features, points, rows, channels,
     AXES: tl.constexpr, LINKED: tl.constexpr, POSITIONS: tl.constexpr, WIDTH: tl.constexpr, SIZE: tl.constexpr,

@@ -46,7 +46,7 @@ def _contracted(x, y, z):
     return x * scale, y * scale, z * scale
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n"])
 def march(
     origins, directions, far, start, occupied, box, first, ray_of, t0_of, t1_of, counts, resume,
     n, edge, limit, step, cone,

@@ -51,7 +51,7 @@ def _response(splat, valid, x, y, means, conics, opacities):
     return dx, dy, xx, xy, yy, falloff, tl.load(opacities + splat, mask=valid, other=0.0) * falloff
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["columns", "width", "height"])
 def rasterise(
     means, conics, opacities, features, entries, starts, image, alpha, rest, ends, columns, width, height,
     TILE: tl.constexpr, CHUNK: tl.constexpr,
@@ -90,7 +90,7 @@ def rasterise(
     tl.store(ends + pixel, end, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["columns", "width", "height"])
 def rasterise_backward(
     means, conics, opacities, features, entries, starts, rest, ends, grad_image, grad_alpha,
     grad_means, grad_conics, grad_opacities, grad_features, absolute, columns, width, height,
