@@ -211,11 +211,12 @@ def _normals(picture: Rendering, change: Callable[[Tensor], Tensor]) -> Renderin
     [
         (_straight, "colours are not premultiplied"),
         (lambda p: _normals(p, lambda normal: 0.5 * normal), "a normal is neither of unit length nor 0"),
+        (lambda p: _normals(p, lambda normal: -normal), "a normal points away from the camera"),
         (lambda p: _normals(p, lambda normal: normalize(normal + 1e-3, dim=-1)), "there is a normal where alpha is below"),
         (lambda p: replace(p, depth=torch.where(p.alpha < 0.5, 0.0, p.depth)), "depth must be infinite where alpha is below"),
         (lambda p: replace(p, alpha=2 * p.alpha), r"alpha leaves \[0, 1\]"),
     ],
-    ids=["straight", "short", "everywhere", "near", "above"],
+    ids=["straight", "short", "away", "everywhere", "near", "above"],
 )
 def test_a_renderer_that_breaks_the_contract_is_refused(
     change: Callable[[Rendering], Rendering], words: str, scene: Scene
@@ -224,6 +225,74 @@ def test_a_renderer_that_breaks_the_contract_is_refused(
     check_renderer(Changed(lambda picture: picture), ball, scene)
     with pytest.raises(AssertionError, match=words):
         check_renderer(Changed(change), ball, scene)
+
+
+class _Strata(Volumetric):
+    def __init__(self) -> None:
+        super().__init__(StratifiedConfig(16).build(toy_scene(views=1, size=8)))
+
+
+class WrongRays(_Strata):
+    """Gives each ray the samples of another one."""
+
+    @override
+    def render_rays(self, field, rays, ctx):
+        return super().render_rays(field, rays[(torch.arange(len(rays)) * 7) % len(rays)], ctx)
+
+
+class Mirrored(_Strata):
+    @override
+    def render_whole(self, field, camera, ctx):
+        rendering, trace = self.render_rays(field, camera.rays(), ctx)
+        size = camera.height, camera.width
+        parts = {name: value.unflatten(0, size).flip(1) for name, value in vars(rendering).items() if value is not None}
+        return Rendering(**parts), trace
+
+
+class Shallow(_Strata):
+    @override
+    def render_rays(self, field, rays, ctx):
+        rendering, trace = super().render_rays(field, rays, ctx)
+        return replace(rendering, depth=torch.where(rendering.alpha >= 0.5, 1e-4, rendering.depth)), trace
+
+
+class Uncounted(_Strata):
+    @override
+    def render_rays(self, field, rays, ctx):
+        rendering, trace = super().render_rays(field, rays, ctx)
+        return rendering, replace(trace, weights=trace.weights / 2)
+
+
+@pytest.mark.parametrize(
+    ("renderer", "words"),
+    [
+        (WrongRays, "the picture does not move|the colour of a ray depends on those before it"),
+        (Mirrored, "does not move with the camera's principal point"),
+        (Shallow, "depth must lie within the bounds"),
+        (Uncounted, "alpha is not the sum of the samples' weights"),
+    ],
+    ids=["rays", "mirrored", "depth", "weights"],
+)
+def test_a_renderer_of_another_picture_is_refused(renderer: Callable[[], Renderer], words: str, scene: Scene) -> None:
+    """Each has the right shapes and ranges, is repeatable, and has gradients."""
+    torch.manual_seed(0)
+    check_renderer(Volumetric(StratifiedConfig(16).build(scene)), Waves(), scene)
+    with pytest.raises(AssertionError, match=words):
+        check_renderer(renderer(), Waves(), scene)
+
+
+class TurnedGradient(Sphere):
+    """A signed distance whose gradient has its axes in another order."""
+
+    @override
+    def query(self, samples: Samples, want: Quantity) -> FieldValues:
+        values = super().query(samples, want)
+        return replace(values, gradient=None if values.gradient is None else values.gradient.flip(1))
+
+
+def test_a_gradient_of_something_else_is_refused(scene: Scene) -> None:
+    with pytest.raises(AssertionError, match="the gradient is not that of the signed distance"):
+        check_field(TurnedGradient(3.0, 0.6), scene)
 
 
 def test_a_renderer_without_a_gradient_to_the_pose_is_refused(scene: Scene) -> None:

@@ -226,7 +226,10 @@ def test_a_comparison_of_a_scene_made_in_python() -> None:
     columns, rows = report.table()
     assert columns[0] == "" and any(SPLATS.name in row[0] for row in rows)
     assert SPLATS.name in report._repr_html_() and report.page.is_file()
-    with pytest.raises(InputError, match="no run of 'splatting/nothing'"):
+    assert report.run(SPLATS, 3).folder == report.run(SPLATS.name, 3).folder
+    with pytest.raises(InputError, match=rf"The fit of '{re.escape(broken.name)}' with seed 3 failed: "):
+        report.run(broken, 3)
+    with pytest.raises(InputError, match=rf"no run of 'splatting/nothing'.*\nIts runs: {SPLATS.name} with seed 3\."):
         report.run("splatting/nothing")
 
 

@@ -8,11 +8,14 @@ A built-in part keeps its name: an entry point of the same name is left out, wit
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import importlib.util
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from pathlib import Path
 from typing import Any
 
 from invgraphics.data import find
@@ -87,6 +90,52 @@ def used_plugins(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
         table: a resolved recipe.
         method: its name.
     """
+    return {name: f"{point.dist.name} {point.dist.version}" for name, point in _used(table, method) if point.dist is not None}
+
+
+def plugin_sources(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
+    """Map the same plug-ins to a hash of the Python files of the packages that hold them, without importing any."""
+    tops = {name: _package(point) for name, point in _used(table, method)}
+    hashes = {top: _source_hash(top) for top in set(tops.values())}
+    return {name: hashes[top] for name, top in tops.items()}
+
+
+def _package(point: EntryPoint) -> str:
+    """Top-level package or module of an entry point."""
+    return point.value.partition(":")[0].partition(".")[0]
+
+
+def _source_hash(package: str) -> str:
+    """Hash of all Python files of a package or module; empty where it is not found."""
+    spec, sha = importlib.util.find_spec(package), hashlib.sha256()
+    if spec is None:
+        return ""
+    roots = [Path(root) for root in spec.submodule_search_locations or ()]
+    files = [(path.relative_to(root), path) for root in roots for path in sorted(root.rglob("*.py"))]
+    if not files and spec.origin is not None and Path(spec.origin).is_file():
+        files = [(Path(package), Path(spec.origin))]
+    for name, path in files:
+        sha.update(name.as_posix().encode() + path.read_bytes())
+    return sha.hexdigest()
+
+
+def raised_in(error: BaseException) -> str:
+    """The third-party function in which an error was raised, and its distribution; empty where no frame is of a plug-in."""
+    points = [point for registry in REGISTRIES for point in _foreign(registry).values()]
+    packages = {_package(point): point.dist for point in points}
+    found, trace = "", error.__traceback__
+    while trace is not None:
+        module = str(trace.tb_frame.f_globals.get("__name__", ""))
+        if (top := module.partition(".")[0]) in packages:
+            dist = packages[top]
+            version = "" if dist is None else f" ({dist.name} {dist.version})"
+            found = f"{module}.{trace.tb_frame.f_code.co_qualname}{version}"
+        trace = trace.tb_next
+    return found
+
+
+def _used(table: Mapping[str, Any], method: str) -> list[tuple[str, EntryPoint]]:
+    """Names and entry points of the plug-ins that a recipe names."""
     used = {method}
     waiting: list[Any] = [table]
     while waiting:
@@ -96,12 +145,8 @@ def used_plugins(table: Mapping[str, Any], method: str = "") -> dict[str, str]:
             waiting += part.values()
         elif isinstance(part, list | tuple):
             waiting += part
-    found = {}
-    for registry in REGISTRIES:
-        for name, point in _foreign(registry).items():
-            if name in used and point.dist is not None:
-                found[name] = f"{point.dist.name} {point.dist.version}"
-    return found
+    points = [pair for registry in REGISTRIES for pair in _foreign(registry).items()]
+    return [(name, point) for name, point in points if name in used]
 
 
 def installed(package: str) -> bool:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from training_fixtures import SMALL
 
 from invgraphics.cli import main
-from invgraphics.core import Scene
+from invgraphics.core import Gaussians, Scene, harmonics
 from invgraphics.errors import InputError
 from invgraphics.experiments import build, fitted
 from invgraphics.experiments.request import FitRequest
@@ -121,8 +121,21 @@ def test_exports_are_in_the_world(run: Path, toy_folder: Path, tmp_path: Path, m
     expected = 2 * local.means @ turn.T + similarity[:3, 3]
     assert torch.allclose(world.means, expected, atol=1e-5)
     assert torch.allclose(world.scales, 2 * local.scales, rtol=1e-5)
+    # What the file is seen to be, by scipy's rotations: shapes and colours turn along, which a round trip would not show.
+    ours, theirs = (_covariances(gaussians) for gaussians in (world, local))
+    assert torch.allclose(ours, 4 * turn.double() @ theirs @ turn.double().T, atol=1e-6)
+    directions = torch.nn.functional.normalize(torch.randn(len(local), 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    seen, expected = harmonics.evaluate(world.sh, directions @ turn.T), harmonics.evaluate(local.sh, directions)
+    assert torch.allclose(seen, expected, atol=1e-4)
+    assert float(expected.std(dim=0).min()) > 0.01
     back = import_run(_import(tmp_path / "world.ply", toy_folder, tmp_path / "b"))
     assert _quality(back)["psnr"] == pytest.approx(_quality(run)["psnr"], abs=1e-3)
+
+
+def _covariances(gaussians: Gaussians) -> torch.Tensor:
+    rotations = Rotation.from_quat(gaussians.quaternions.double().roll(-1, 1).numpy()).as_matrix()  # scipy's have w last
+    factors = torch.from_numpy(rotations) * gaussians.scales.double()[:, None]
+    return factors @ factors.mT
 
 
 def _exported(run: Path, out: Path, to: str = "ply", **more: str) -> Path:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from invgraphics import plugins
 from invgraphics.cli import main
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
@@ -193,3 +195,27 @@ def test_a_package_that_fails_to_import_is_named(environment: dict[str, str], tm
     assert done.returncode == 2
     assert "third-party-fog" in done.stderr and "a_module_that_is_not_there" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_its_code_is_part_of_a_runs_identity_and_named_where_it_fails(
+    environment: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Edited, or in another version, it makes other runs; an exception in it is no fault of ours."""
+    site = Path(shutil.copytree(environment["PYTHONPATH"].split(os.pathsep)[0], tmp_path / "site"))
+    monkeypatch.syspath_prepend(str(site))
+    table = {"field": {"type": "fog"}, "renderer": {"type": "volumetric"}}
+    before = plugins.plugin_sources(table, "volumetric/fog")
+    assert set(before) == {"fog", "volumetric/fog"} and before == plugins.plugin_sources(table, "volumetric/fog")
+    assert plugins.plugin_sources({"field": {"type": "neural"}}, "volumetric/hash") == {}
+    with (site / "third_party_fog.py").open("a") as file:
+        file.write("\n# faster\n")
+    assert plugins.plugin_sources(table, "volumetric/fog")["fog"] != before["fog"]
+    fog = plugins.load("fields", "fog")(0.5).build(None)
+    monkeypatch.delitem(sys.modules, "third_party_fog")
+    with pytest.raises(TypeError) as caught:
+        fog.query(None, None)
+    assert plugins.raised_in(caught.value) == "third_party_fog.Fog.query (third-party-fog 1.0)"
+    assert main.explain(caught.value)[1][1].startswith("It was raised in third_party_fog.Fog.query (third-party-fog 1.0)")
+    with pytest.raises(ZeroDivisionError) as own:
+        raise ZeroDivisionError
+    assert main.explain(own.value)[1][1].startswith("This is a fault of invgraphics")

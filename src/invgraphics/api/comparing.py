@@ -65,29 +65,32 @@ class ComparisonResult:
         """Failed fits, with their errors."""
         return self.record.failures
 
-    def run(self, method: str, seed: int = 0) -> FolderRun:
-        """Open the run of a method.
+    def run(self, method: str | Method, seed: int = 0) -> FolderRun:
+        """Open the run of a method, given by its name or as it was given to `compare`.
 
         Raises:
             InputError: there is no such run, or it failed.
         """
         return load_run(self._run_folder(method, seed))
 
-    def scores(self, method: str, seed: int = 0) -> ScoreTable:
-        """Scores of a method.
+    def scores(self, method: str | Method, seed: int = 0) -> ScoreTable:
+        """Scores of a method, given as to `run`.
 
         Raises:
             InputError: there is no such run, or it failed.
         """
         return ScoreTable(RunFolder(self._run_folder(method, seed)).read_scores())
 
-    def _run_folder(self, method: str, seed: int) -> Path:
+    def _run_folder(self, method: str | Method, seed: int) -> Path:
+        name = method.name if isinstance(method, Method) else method
         for run in self.record.runs:
-            if (run.method, run.seed) == (method, seed):
+            if (run.method, run.seed) == (name, seed):
                 return run.folder
-        raise InputError(
-            f"{self.folder} has no run of '{method}' with seed {seed}.", f"Its methods: {', '.join(self.methods)}."
-        )
+        for failure in self.failures:
+            if (failure.method, failure.seed) == (name, seed):
+                raise InputError(f"The fit of '{name}' with seed {seed} failed: {failure.error}")
+        known = [f"{run.method} with seed {run.seed}" for run in self.record.runs]
+        raise InputError(f"{self.folder} has no run of '{name}' with seed {seed}.", f"Its runs: {', '.join(known) or 'none'}.")
 
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Summary table of the report: headings, and a row of texts for each method and baseline; * marks significant leads."""

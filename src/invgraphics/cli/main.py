@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
+from invgraphics import plugins
 from invgraphics.cli.arguments import parse
 from invgraphics.errors import InputError, NumericalError, did_you_mean
 from invgraphics.files import file_fault
@@ -131,10 +132,9 @@ def explain(error: Exception) -> tuple[int, list[str]]:
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error):
         return FAILED, ["There is not enough memory.", "Try a smaller --size, or smaller settings of the method (--set)."]
     first = (str(error).splitlines() or [""])[0]
-    return FAILED, [
-        f"Unexpected {type(error).__name__}: {first}",
-        "This is a fault of invgraphics, not of your input; --debug shows where it happened.",
-    ]
+    where = plugins.raised_in(error)
+    fault = f"It was raised in {where}" if where else "This is a fault of invgraphics, not of your input"
+    return FAILED, [f"Unexpected {type(error).__name__}: {first}", f"{fault}; --debug shows where it happened."]
 
 
 def _command(name: str) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.environment import code_version
@@ -62,9 +63,11 @@ def run_digest(job: Job, truth: str, threads: int) -> str:
     """
     method = job.method
     source = getattr(method.recipe.field, "source", "")
-    started_from = {"source": _source_digest(Path(source))} if source else {}
+    more: dict[str, Any] = {"source": _source_digest(Path(source))} if source else {}
+    if foreign := plugins.plugin_sources(method.table, method.name):
+        more["plugins"] = foreign
     return sha256_of(
-        started_from
+        more
         | {
             "method": method.name,
             "recipe": method.digest,

@@ -26,6 +26,7 @@ from invgraphics.core import (
     Scene,
     Trace,
 )
+from invgraphics.errors import InputError
 from invgraphics.renderers.base import to_rendering
 from invgraphics.renderers.quadrature import integrate, sample_weights
 from invgraphics.renderers.samplers import StratifiedConfig
@@ -186,12 +187,33 @@ def _query_above(threshold: float, field: Field, samples: Samples, rays: int, wa
 
 
 def query(field: Field, samples: Samples, want: Quantity, chunk: int) -> FieldValues:
-    """Query a field in chunks of at most ``chunk`` samples, which bounds the memory of its activations."""
+    """Query a field in chunks of at most ``chunk`` samples, which bounds the memory of its activations.
+
+    Raises:
+        InputError: the field returns values of wrong shapes, or none of what is wanted.
+    """
     if len(samples) <= chunk:
-        return field.query(samples, want)
-    parts = [field.query(samples[start : start + chunk], want) for start in range(0, len(samples), chunk)]
+        return _checked(field, samples, want)
+    parts = [_checked(field, samples[start : start + chunk], want) for start in range(0, len(samples), chunk)]
     joined = {}
     for entry in fields(FieldValues):
         values = [getattr(part, entry.name) for part in parts]
         joined[entry.name] = None if values[0] is None else torch.cat(values)
     return FieldValues(**joined)
+
+
+_COLUMNS = {"density": (), "sdf": (), "gradient": (3,), "radiance": (3,), "normal": (3,)}
+"""Quantity -> the shape of its value at one sample."""
+
+
+def _checked(field: Field, samples: Samples, want: Quantity) -> FieldValues:
+    """Query a field whose author may have mistaken a shape: kernels and indices further on would not say so."""
+    values = field.query(samples, want)
+    for name, columns in _COLUMNS.items():
+        value, expected = getattr(values, name), (len(samples), *columns)
+        if value is None and name != "normal" and Quantity[name.upper()] in want:
+            raise InputError(f"{type(field).__name__}.query returned no {name}, which it was asked for.")
+        if value is not None and tuple(value.shape) != expected:
+            sentence = f"{type(field).__name__}.query returned {name} of shape {tuple(value.shape)} for {len(samples)} samples."
+            raise InputError(sentence, f"Expected: {expected}.")
+    return values
