@@ -20,7 +20,7 @@ GIVEN_UP = f"Terminated; not even a step was over within {GRACE_SECONDS:g} s. Wh
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM came: something that has no time, unlike somebody at a terminal, wants the process to end."""
+    """SIGTERM came: unlike after Ctrl-C at a terminal, SIGKILL may follow within seconds."""
 
     raised = False
     """Whether it was ever raised in this process: a library that it passes through may turn it into an exception of its own."""

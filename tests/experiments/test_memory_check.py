@@ -136,18 +136,18 @@ def test_the_forecast_covers_gaps_that_were_measured(toy_folder: Path) -> None:
     [
         ("volumetric/dvgo", "laptop", "", 90e6, 532e6),
         ("volumetric/dvgo", "hour", "hooks.1.min_spacing=0", 100e6, 5710e6),
+        ("volumetric/plenoxels", "laptop", "", 150e6, 723e6),
         ("volumetric/plenoxels", "hour", "hooks.1.min_spacing=0", 160e6, 1833e6),
     ],
 )
 def test_the_forecast_covers_lattices_that_grow(
     toy_folder: Path, method: str, preset: str, override: str, held: float, peak: float
 ) -> None:
-    """Peaks of fits on `bricks` at 128 px (laptop) and `mic` at 800: 48 vertices along an edge became 112, 256 and 320."""
+    """Peaks of fits at 128 px on `bricks` and `room`, and of `mic` at 800: 48 vertices along an edge became 112, 256, 320."""
     scene, device = open_scene(str(toy_folder), SceneOptions()), torch.device("cpu")
     found = load_method(method, preset, [override] if override else [])
     forecast = memory_forecast(build_plan(found, scene, Budget(seconds=60.0), 0, device), found, int(held))
-    print(forecast.bytes / 1e6)
-    assert peak < forecast.bytes < (8 if "plenoxels" in method else 1.6) * peak
+    assert peak < forecast.bytes < 2.5 * peak
 
 
 def test_a_network_is_not_counted_once_for_every_point(toy_folder: Path) -> None:

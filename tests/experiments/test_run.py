@@ -380,6 +380,7 @@ def test_a_full_disk_is_said_and_keeps_the_last_checkpoint(toy_folder: Path, tmp
         error = json.loads((tmp_path / "job.error.json").read_text())
         assert "cannot be written: the disk is full" in error["error"] and str(small / "run") in error["error"]
         assert not list((small / "run").glob("*.tmp"))
+        assert int(load(small / "run" / CHECKPOINT)["fit"]["steps"]) > 0
     finally:
         subprocess.run(["umount", str(small)], check=True)
 

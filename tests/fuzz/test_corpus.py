@@ -101,6 +101,15 @@ def long_names(root: Path) -> Path:
     return root
 
 
+def large_quaternion(root: Path) -> Path:
+    """A COLMAP model whose first image has a rotation of that length."""
+    seeds.colmap_text(root)
+    path = root / "sparse" / "0" / "images.txt"
+    words = path.read_text().split(" ")
+    path.write_text(" ".join([words[0], "1e200", *words[2:]]))
+    return root
+
+
 def points_at(value: float) -> np.ndarray:
     """Points of which one is elsewhere."""
     points = np.zeros((4, 3))
@@ -160,7 +169,7 @@ BAD_SCENES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "COLMAP name of 400 characters": (long_names, "None of the 3"),
     "COLMAP name that is no UTF-8": (no_utf8, "name is no text in UTF-8"),
     "PNG chunk of 4 GB": (long_chunk, "is damaged: the chunk at byte 33 is cut off"),
-    "COLMAP quaternion of 1e200": (text("images.txt", "1 ", "1 1e200 1e200 "), "."),
+    "COLMAP quaternion of 1e200": (large_quaternion, "quaternion|rotation|pose"),
     "COLMAP point of NaN": (text("points3D.txt", " 0.0 0.0 0.0 ", " nan 0.0 0.0 "), "cannot be read"),
     "COLMAP point of 1e300": (text("points3D.txt", " 0.0 0.0 0.0 ", " 1e300 0.0 0.0 "), "points|near plane"),
 }

@@ -63,7 +63,8 @@ def test_equals_its_parts(parts, space, cone) -> None:
     exact_sums, exact_alpha = reference.ngp_render(*in_float64(rays, occupied, bounds, steps, field))
     assert 0.2 < float(exact_alpha.mean()) < 0.99
     # A step on a cell's wall may be kept by one of the two only.
-    off = ((alpha - exact_alpha).abs() > 1e-5) | ((sums - exact_sums).abs() > 1e-5 * exact_sums.abs().max()).any(dim=1)
+    near = (sums - exact_sums).abs() <= 1e-5 * exact_sums.abs().max()
+    off = ~(((alpha - exact_alpha).abs() <= 1e-5) & near.all(dim=1))
     assert off.sum() <= 0.01 * len(rays)
     assert torch.equal(sums, again[0])
     assert torch.equal(alpha, again[1])

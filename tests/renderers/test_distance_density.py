@@ -217,6 +217,23 @@ def test_gradients_in_parameters_pose_and_width(make, make_camera):
 
 
 @pytest.mark.parametrize("make", ["volsdf", "neus"])
+def test_normals_are_those_of_the_ball(make):
+    """Where rays of a camera meet it, up to its silhouette, in the scene's axes and towards the camera."""
+    camera = toy_scene(views=1, size=40, zoom=1.3).train[0].camera.to(torch.float64)
+    renderer = volsdf(400, beta=0.01) if make == "volsdf" else neus(400, sharpness=200.0)
+    rays = camera.rays()
+    towards = (rays.origins * rays.directions).sum(dim=1)
+    under = towards**2 - rays.origins.square().sum(dim=1) + 0.6**2
+    clear = under > 0.01  # a ray that grazes the ball sees its fuzzy edge
+    ball = Sphere(1.0, 0.6).double()
+    rendering, _ = renderer.render_rays(ball, rays, Context(box(), geometry=True))
+    expected = normalize(rays.origins + (-towards - under.clamp_min(0).sqrt())[:, None] * rays.directions, dim=1)
+    assert int(clear.sum()) > 100
+    error = torch.rad2deg((rendering.normal * expected).sum(dim=1)[clear].clamp(-1, 1).acos())
+    assert float(error.mean()) < 1 and float(error.max()) < 5
+
+
+@pytest.mark.parametrize("make", ["volsdf", "neus"])
 def test_what_becomes_of_the_width(make):
     scene, field = toy_scene(views=2, size=4), Sphere(1.0, 0.5)
     config = VolSDFConfig if make == "volsdf" else NeuSConfig

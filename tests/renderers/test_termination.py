@@ -133,16 +133,23 @@ def test_normals_are_asked_of_few_and_the_picture_stays(make_scene: Callable[...
 
 
 def test_gradients_reach_every_kept_sample(make_scene: Callable[..., Scene]) -> None:
-    """Where gradients are wanted the field is asked in full: density found on the way has none."""
-    scene = make_scene()
-    field = Sphere(3.0, 0.8)
-    field.density = torch.nn.Parameter(torch.tensor(3.0))  # type: ignore[assignment]
-    rendering, trace = Volumetric(STOPPING.build(scene)).render_rays(field, scene.train[0].camera.rays(), Context(scene.bounds))
-    assert trace.values is not None
-    assert trace.values.radiance is not None
-    assert float(trace.values.radiance.detach().min()) > 0
-    rendering.alpha.sum().backward()
-    assert field.density.grad is not None
+    """Where gradients are wanted the field is asked in full: density found on the way has none.
+
+    What is not kept has next to no weight, and so next to no gradient.
+    """
+    scene, gradients = make_scene(), []
+    for config in (STOPPING, replace(STOPPING, stop="never")):
+        field = Sphere(3.0, 0.8)
+        rays = scene.train[0].camera.rays()
+        rendering, trace = Volumetric(config.build(scene)).render_rays(field, rays, Context(scene.bounds))
+        assert trace.values is not None
+        assert trace.values.radiance is not None
+        assert float(trace.values.radiance.detach().min()) > 0
+        rendering.alpha.sum().backward()
+        assert field.density.grad is not None
+        gradients.append(float(field.density.grad))
+    assert gradients[0] == pytest.approx(gradients[1], rel=0.02)
+    assert gradients[1] > 0
 
 
 @pytest.mark.parametrize("config", [STOPPING, StratifiedConfig(16)])

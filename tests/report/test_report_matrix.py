@@ -123,7 +123,7 @@ def test_a_pattern_leaves_out_what_does_not_go_with_the_scene(tmp_path: Path, mo
         overrides=("batches.opaque=false",),
     )
     kept, jobs, seen, refused = comparing._resolve(request)
-    assert isinstance(seen, Scene)
+    assert all(isinstance(one, Scene) for one in seen)
     assert kept.methods == ("splatting/gaussians", "volumetric/hash")
     assert [job.request.method for job in jobs] == list(kept.methods)
     assert refused == [Refusal(method="splatting/gaussians-mip", reason="It needs more views.")]

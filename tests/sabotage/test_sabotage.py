@@ -1,7 +1,8 @@
 """Faults at random moments of commands: afterwards the same command goes on, and ends with the results of an undisturbed one.
 
-``INVGRAPHICS_SABOTAGE`` is the number of moments, ``INVGRAPHICS_SABOTAGE_SEED`` repeats a day's (YYYYMMDD). The test suite
-takes a handful of fits and reports; ``make sabotage`` takes 200 of everything. ``INVGRAPHICS_SABOTAGE_ONLY`` picks some of them
+``INVGRAPHICS_SABOTAGE`` is the number of moments, of a seed that changes with the day (YYYYMMDD), which
+``INVGRAPHICS_SABOTAGE_SEED`` repeats. The test suite takes a handful of fits and reports, of one seed; ``make sabotage`` takes
+200 of everything. ``INVGRAPHICS_SABOTAGE_ONLY`` picks some of them
 by their numbers, ``19,55,100-149`` for instance.
 """
 
@@ -28,7 +29,8 @@ from faults import DONE, faults, small_disk
 
 HANDFUL = 6
 COUNT = int(os.environ.get("INVGRAPHICS_SABOTAGE", HANDFUL))
-SEED = int(os.environ.get("INVGRAPHICS_SABOTAGE_SEED", f"{datetime.datetime.now(datetime.UTC):%Y%m%d}"))
+TODAY = f"{datetime.datetime.now(datetime.UTC):%Y%m%d}" if "INVGRAPHICS_SABOTAGE" in os.environ else "20261130"
+SEED = int(os.environ.get("INVGRAPHICS_SABOTAGE_SEED", TODAY))
 ONLY = os.environ.get("INVGRAPHICS_SABOTAGE_ONLY", "")
 ON_A_DISK_OF_ITS_OWN = "full disk"
 

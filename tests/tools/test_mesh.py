@@ -263,7 +263,8 @@ def test_a_fitted_density_is_seen_as_a_mesh(runs: dict[str, Path], toy_folder: P
     run = ig.load_run(source)
     model = run.through(variant)
     picture = model.render(run.scene.test[0].camera)
-    assert set(picture.alpha.unique().mul(9).round().tolist()) <= set(map(float, range(10)))  # opaque triangles, 9 rays each
+    ninths = 9 * picture.alpha  # opaque triangles, 9 rays each
+    torch.testing.assert_close(ninths, ninths.round(), atol=1e-4, rtol=0)
     native = run.scores["psnr"]
     assert 15 < shown.quality["psnr"].mean < native  # a level of 1 makes the fog thick
     assert shown.quality["alpha_iou"].mean > 0.7

@@ -58,7 +58,10 @@ class FittedRun(ABC):
     @property
     @abstractmethod
     def history(self) -> tuple[Moment, ...]:
-        """Training history: ``step``, ``seconds``, ``progress``, and ``psnr`` on held-out views."""
+        """Training history: ``step``, ``seconds``, ``progress``, ``psnr`` on held-out views, and ``loss``.
+
+        It has a dozen moments; ``on_step`` sees every step's ``fit.loss``.
+        """
 
     @property
     @abstractmethod

@@ -143,7 +143,8 @@ def memory_forecast(plan: Plan, method: Method, held: int) -> MemoryForecast:
         sentence = f"{most:,} primitives need about {needed / 1e9:.1f} GB of memory, and this machine has {has / 1e9:.1f} GB."
         raise InputError(sentence, "Choose a lower --max-primitives.")
     growth = (most - now) * (COPIES * row + SCREEN_BYTES)
-    lattices = max(0, upsampled_bytes(method, plan.scene) - model_bytes([field])) * (TRAINED_COPIES + CHECKPOINT_COPIES)
+    finest, links = upsampled_bytes(method, plan.scene)
+    lattices = max(0, finest - model_bytes([field])) * (TRAINED_COPIES + CHECKPOINT_COPIES) + 2 * links
     parameters = model_bytes(plan.modules.values()) + (most - now) * row
     on_rays = isinstance(plan.model.renderer, RayRenderer)
     sizes = [size_of(view) for view in plan.scene.train]

@@ -1,4 +1,4 @@
-"""Names under which the field knows methods, and suggestions made from them."""
+"""Names of methods in the literature, and suggestions made from them."""
 
 from __future__ import annotations
 

@@ -74,6 +74,7 @@ class Fit:
         plan: what is fitted, and how.
         steps: number of steps taken.
         seconds: wall time of these steps.
+        loss: of the latest step.
         idle_losses: numbers of the losses that the first step gave nothing to act on, so that they are 0 without a gradient.
     """
 
@@ -93,6 +94,7 @@ class Fit:
         self.steps = 0
         self.seconds = 0.0
         self.idle_losses: tuple[int, ...] = ()
+        self.loss: float | None = None
         self.resume_clocks({})
         self._bounds = plan.scene.bounds.to(plan.device)
         self._generator = torch.Generator().manual_seed(plan.seed)
@@ -163,7 +165,7 @@ class Fit:
         for hook in plan.hooks:
             hook.after_step(state)
         plan.model.renderer.update(plan.model.field, ctx)
-        self.steps += 1
+        self.steps, self.loss = self.steps + 1, value
         if plan.device.type == "cuda":
             torch.cuda.synchronize(plan.device)
         self._advance_clocks(time.perf_counter() - began, time.process_time() - cpu_began)

@@ -55,7 +55,7 @@ class Speeds:
         return "" if self.median is None else f"{self.least:.2f} to {self.most:.2f} of the median"
 
 
-def short_of_time(runs: Sequence[Run]) -> list[Run]:
+def cpu_starved_fits(runs: Sequence[Run]) -> list[Run]:
     """Fits of a budget of seconds with much less of their processor time than the fit with most: fewer steps, lower quality."""
     shares = {id(run): share for run in runs if _by_time(run) and (share := run.scores.cost.get("fit_processor_share"))}
     most = max(shares.values(), default=0.0)
@@ -65,7 +65,7 @@ def short_of_time(runs: Sequence[Run]) -> list[Run]:
 def disturbed_fits(observations: Sequence[Observation], quantity: MeasuredQuantity) -> list[Observation]:
     """Fits whose value of a quantity is not to be compared with other fits' of their scene.
 
-    Of times these are the fits whose clock was disturbed, of qualities those that are `short_of_time`.
+    Of times these are the fits whose clock was disturbed, of qualities those that are `cpu_starved_fits`.
     """
     if quantity.key not in TIMES and quantity.group == "cost":
         return []
@@ -73,7 +73,7 @@ def disturbed_fits(observations: Sequence[Observation], quantity: MeasuredQuanti
     for scene in {one.scene for one in observations}:
         runs = [one.run for one in observations if one.scene == scene]
         speeds = Speeds.of(runs)
-        found = [run for run in runs if speeds.disturbance(run)] if quantity.key in TIMES else short_of_time(runs)
+        found = [run for run in runs if speeds.disturbance(run)] if quantity.key in TIMES else cpu_starved_fits(runs)
         left_out |= set(map(id, found))
     return [one for one in observations if id(one.run) in left_out]
 

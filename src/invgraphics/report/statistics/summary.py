@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.statistics.clocks import Speeds, short_of_time
+from invgraphics.report.statistics.clocks import Speeds, cpu_starved_fits
 from invgraphics.report.statistics.intervals import mean_half_width
 from invgraphics.report.statistics.leaders import leaders
 from invgraphics.report.statistics.values import value_of, without_score
@@ -56,7 +56,7 @@ class Row:
         complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
             missing makes a mean look better than it is.
         disturbed: why its times are not ranked: what is wrong with the clock of its fits; empty where nothing is.
-        slowed: whether one of its fits was `short_of_time`: its quality is not ranked either.
+        slowed: whether one of its fits was `cpu_starved_fits`: its quality is not ranked either.
         lost: keys of the columns in which one of its fits diverged, or alone has no value; the others are not ranked either.
     """
 
@@ -143,7 +143,7 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
     columns = table_columns(comparison)
     absences: dict[str, list[str]] = {}
     rows = []
-    speeds, short = Speeds.of(comparison.runs), set(map(id, short_of_time(comparison.runs)))
+    speeds, short = Speeds.of(comparison.runs), set(map(id, cpu_starved_fits(comparison.runs)))
     most = max((len(comparison.runs_of(method)) for method in comparison.methods), default=0)
     for series, method in enumerate(comparison.methods):
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
