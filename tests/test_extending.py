@@ -73,7 +73,8 @@ def _run(environment: dict[str, str], *arguments: str) -> str:
 
 
 def test_signatures_on_the_page_are_those_of_the_contract() -> None:
-    for owner, name in ((core.Field, "query"), (core.RayRenderer, "render_rays"), (Loader, "matches"), (Loader, "load")):
+    contracts = ((core.Field, "query"), (core.RayRenderer, "render_rays"), (core.Sampler, "sample"))
+    for owner, name in (*contracts, (Loader, "matches"), (Loader, "load")):
         hints = owner.__dict__[name].__annotations__
         written = ", ".join(f"{key}: {hint}" for key, hint in hints.items() if key != "return")
         assert f"`{name}({written}) -> {hints['return']}`" in PAGE, name
@@ -97,14 +98,16 @@ def test_signatures_on_the_page_are_those_of_the_contract() -> None:
 
 def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable: Path, tmp_path: Path) -> None:
     code = (
-        "from voxel_world import VoxelsConfig, BrightestConfig\n"
+        "from voxel_world import VoxelsConfig, BrightestConfig, MidpointsConfig\n"
         "from invgraphics.testing import check_field, check_renderer, toy_scene\n"
         "toy = toy_scene(views=2, size=8)\n"
         "check_field(VoxelsConfig(resolution=8).build(toy), toy)\n"
         "check_renderer(BrightestConfig(count=16).build(toy), VoxelsConfig(resolution=8).build(toy), toy)\n"
         "import invgraphics as ig\n"
+        "volume = ig.renderers.volumetric.VolumetricConfig(MidpointsConfig(count=16)).build(toy)\n"
+        "check_renderer(volume, VoxelsConfig(resolution=8).build(toy), toy)\n"
         "from invgraphics.cli import main\n"
-        "main.run(['list', 'fields', 'renderers', 'methods'])\n"
+        "main.run(['list', 'fields', 'renderers', 'samplers', 'methods'])\n"
         f"scene = ig.load_scene({str(turntable)!r})\n"
         "small = {'field.resolution': 16, 'batches.rays': 256}\n"
         "names = ['volumetric/voxels', 'brightest/voxels']\n"
@@ -115,7 +118,7 @@ def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable:
         "print((report.run(report.methods[0]).through('brightest/voxels')).render(scene.test[0].camera).rgb.shape)\n"
     )
     *listed, numbers, shape = _run(environment, "-c", code).splitlines()
-    for name in ("voxel_world:VoxelsConfig", "voxel_world:BrightestConfig", "brightest/voxels"):
+    for name in ("voxel_world:VoxelsConfig", "voxel_world:BrightestConfig", "voxel_world:MidpointsConfig", "brightest/voxels"):
         assert any(name in line for line in listed), name
     train, test, failures, *psnr = numbers.split()
     assert (train, test, failures, shape) == ("14", "2", "()", "torch.Size([20, 20, 3])")
