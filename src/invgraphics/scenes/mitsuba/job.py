@@ -18,8 +18,9 @@ from invgraphics.text import sha256_of
 # What decides pixels besides the scene's own builder, relative to the package; the rest (caching, messages) does not.
 _SOURCES = (
     "scenes/mitsuba/rig.py", "scenes/mitsuba/stage.py", "scenes/mitsuba/gbuffer.py", "scenes/mitsuba/render.py",
-    "scenes/mitsuba/folder.py", "core/camera.py", "core/transforms.py", "core/colour.py",
+    "scenes/mitsuba/folder.py", "scenes/mitsuba/ply.py", "core/camera.py", "core/transforms.py", "core/colour.py",
 )  # fmt: skip
+_AVERAGING_SOURCES = ("scenes/mitsuba/average.py", "scenes/pictures/resize.py")
 _CLASS_SOURCES = (*_SOURCES, "scenes/mitsuba/instances.py")
 _BUILD = "scenes/mitsuba/build"
 _IMPORTED = re.compile(r"^(?:from|import) invgraphics\.scenes\.mitsuba\.build\.(\w+)", re.MULTILINE)
@@ -93,6 +94,7 @@ class Job:
     def key(self) -> str:
         """Hash of everything the pixels depend on: description, options, our sources, Mitsuba's version and variant."""
         paths = _SOURCES if self.spec.instances is None else _CLASS_SOURCES
+        paths += () if self.source is None else _AVERAGING_SOURCES
         sources, versions = _source_hash(self.spec.builder, paths), {name: version(name) for name in ("mitsuba", "drjit")}
         content = {"job": self.table(), "sources": sources, **versions}
         return sha256_of(content)[:16]
