@@ -35,7 +35,7 @@ notebooks: env  ## run the notebooks and write them as pages: reports/notebooks
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[notebooks]"
 	$(BIN)/python notebooks/render.py
 
-test: env  ## compile the kernels, once for all processes (2 minutes), and run the test suite (10 to 12 on 2 cores)
+test: env  ## compile the kernels, once for all processes (2 minutes), and run the test suite (11 to 13 on 2 cores)
 	$(BIN)/invgraphics doctor --warm-up
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
