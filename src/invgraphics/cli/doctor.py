@@ -63,9 +63,10 @@ def _processor() -> Iterator[Finding]:
     import torch
 
     from invgraphics.experiments.environment import cpu_name
+    from invgraphics.experiments.executors.local import cores as usable_cores
 
     cores, threads = os.cpu_count() or 1, torch.get_num_threads()
-    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else cores
+    allowed = usable_cores()
     yield Finding("processor", f"{cpu_name()}, {cores} cores, {torch.backends.cpu.get_cpu_capability()} instructions")
     limited = threads < allowed and "OMP_NUM_THREADS" in os.environ
     remedy = "unset OMP_NUM_THREADS, or accept slower fits; scores are compared at equal threads only" if limited else ""

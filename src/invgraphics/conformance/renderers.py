@@ -14,7 +14,8 @@ from invgraphics.core.rendering import Rendering
 def check_renderer(renderer: Renderer, field: Field, scene: Scene) -> None:
     """Assert the contract of a renderer: shapes, ranges, repeatability, and gradients to the field and the pose.
 
-    Colours are premultiplied, normals of unit length; where alpha is below 1/2, depth is far and no normal is given.
+    Colours are premultiplied, normals of unit length and towards the camera; where alpha is below 1/2, depth is infinite and no
+    normal is given. Pixels are where the camera sees them, and rays independent of each other.
 
     Args:
         renderer: any.

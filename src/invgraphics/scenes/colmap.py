@@ -82,9 +82,8 @@ def _with_tracks(scene: Scene, model: Model) -> Scene:
 def _photo(image: Any, folder: Path) -> Photo:
     where = f"image '{image.name}'"
     lens = Lens(image.camera.model_name, tuple(float(v) for v in image.camera.params), image.camera.width, image.camera.height)
-    pinhole = (
-        lens.is_pinhole()
-    )  # refuses models without a focal length, which pycolmap cannot be asked for: it ends the process
+    # First: it refuses models without a focal length, and pycolmap ends the process when it is asked for theirs.
+    pinhole = lens.is_pinhole()
     if not np.isfinite(lens.params).all() or image.camera.focal_length_x <= 0 or image.camera.focal_length_y <= 0:
         raise InputError(f"The camera of {where} has parameters {lens.params}, which no lens has.")
     world_to_cam = torch.from_numpy(np.array(image.cam_from_world().matrix(), dtype=np.float64))

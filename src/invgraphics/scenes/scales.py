@@ -14,6 +14,7 @@ from invgraphics.core import Scene, View
 from invgraphics.core.colour import quantise
 from invgraphics.errors import InputError
 from invgraphics.scenes.open import open_scene, source_of
+from invgraphics.scenes.pictures.masks import WHOLE
 from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 
 SMALLEST = 12
@@ -100,5 +101,5 @@ def resized_view(view: View, width: int, height: int) -> View:
         alpha=coverage,
         depth=None,
         normal=None,
-        mask=None if valid is None else valid > 1 - 1e-6,
+        mask=None if valid is None else valid > WHOLE,
     )

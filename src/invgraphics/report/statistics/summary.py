@@ -56,7 +56,7 @@ class Row:
         complete: it has as many runs as the method with the most. Others are shown but never ranked: a hard seed that is
             missing makes a mean look better than it is.
         disturbed: why its times are not ranked: what is wrong with the clock of its fits; empty where nothing is.
-        slowed: whether one of its fits was `cpu_starved_fits`: its quality is not ranked either.
+        starved: whether one of its fits is among the `cpu_starved_fits`: its quality is not ranked either.
         lost: keys of the columns in which one of its fits diverged, or alone has no value; the others are not ranked either.
     """
 
@@ -68,12 +68,12 @@ class Row:
     cells: tuple[Cell, ...]
     complete: bool = True
     disturbed: str = ""
-    slowed: bool = False
+    starved: bool = False
     lost: frozenset[str] = frozenset()
 
     def ranked_in(self, column: MeasuredQuantity) -> bool:
         """Whether it is ranked in a column: it lacks no seed and no seed's value, and no fit was disturbed in what counts."""
-        disturbed = (self.disturbed and column.key in TIMES) or (self.slowed and column.group != "cost")
+        disturbed = (self.disturbed and column.key in TIMES) or (self.starved and column.group != "cost")
         return self.complete and column.key not in self.lost and not disturbed
 
 
@@ -122,7 +122,7 @@ class Summary:
     def disturbances(self) -> tuple[str, ...]:
         """A sentence for each method whose times, or quality too, are not ranked."""
         return tuple(
-            f"The times {'and the quality ' if row.slowed else ''}of {row.label} are not ranked: {row.disturbed}."
+            f"The times {'and the quality ' if row.starved else ''}of {row.label} are not ranked: {row.disturbed}."
             for row in self.methods
             if row.disturbed
         )
@@ -143,16 +143,15 @@ def summarise(comparison: Comparison, tables: int = 1) -> Summary:
     columns = table_columns(comparison)
     absences: dict[str, list[str]] = {}
     rows = []
-    speeds, short = Speeds.of(comparison.runs), set(map(id, cpu_starved_fits(comparison.runs)))
+    speeds, starved = Speeds.of(comparison.runs), set(map(id, cpu_starved_fits(comparison.runs)))
     most = max((len(comparison.runs_of(method)) for method in comparison.methods), default=0)
     for series, method in enumerate(comparison.methods):
         runs, failures = comparison.runs_of(method), comparison.failures_of(method)
         cells = tuple(_method_cell(column, runs, absences) for column in columns)
         kind: Literal["method", "failed"] = "method" if runs else "failed"
         lost = frozenset(column.key for column in columns if without_score(runs, column))
-        disturbed, slowed = _disturbed(runs, speeds), any(id(run) in short for run in runs)
-        complete = len(runs) == most
-        rows.append(Row(method, kind, series, len(runs), failures, cells, complete, disturbed, slowed, lost))
+        clock = _disturbed(runs, speeds), any(id(run) in starved for run in runs)
+        rows.append(Row(method, kind, series, len(runs), failures, cells, len(runs) == most, *clock, lost))
     for name, quality in comparison.baselines.items():
         cells = tuple(_cell(column, _known([_mean(quality.get(column.key))])) for column in columns)
         rows.append(Row(name, "baseline", -1, 1, (), cells))
