@@ -3,7 +3,7 @@
 import pytest
 
 from invgraphics.bench import timing
-from invgraphics.bench.timing import Effort, Timing, alternate
+from invgraphics.bench.timing import Timing, TimingBudget, alternate
 
 
 @pytest.fixture
@@ -25,13 +25,13 @@ def clockwork(monkeypatch: pytest.MonkeyPatch):
 
 def test_variants_take_turns(clockwork) -> None:
     calls, variant = clockwork
-    alternate({"a": variant("a", 0.125), "b": variant("b", 0.125)}, Effort(0.375, 1, 10))
+    alternate({"a": variant("a", 0.125), "b": variant("b", 0.125)}, TimingBudget(0.375, 1, 10))
     assert "".join(calls) == "ab" + "ababab"
 
 
 def test_a_slow_variant_is_repeated_less_and_its_first_call_counts(clockwork) -> None:
     calls, variant = clockwork
-    found = alternate({"slow": variant("s", 2.0), "fast": variant("f", 0.1)}, Effort(1.0, 2, 5))
+    found = alternate({"slow": variant("s", 2.0), "fast": variant("f", 0.1)}, TimingBudget(1.0, 2, 5))
     assert "".join(calls) == "sf" + "f" + "sf" + "fff"
     assert (found["slow"].repetitions, found["fast"].repetitions) == (2, 5)
     assert found["slow"].median == pytest.approx(2.0) and found["fast"].median == pytest.approx(0.1)
@@ -40,7 +40,7 @@ def test_a_slow_variant_is_repeated_less_and_its_first_call_counts(clockwork) ->
 def test_a_first_call_that_compiles_does_not_count(clockwork) -> None:
     calls, variant = clockwork
     first, later = variant("c", 0.5), variant("w", 0.1)
-    found = alternate({"x": lambda: later() if calls else first()}, Effort(1.0, 3, 3))
+    found = alternate({"x": lambda: later() if calls else first()}, TimingBudget(1.0, 3, 3))
     assert found["x"].high == pytest.approx(0.1)
 
 

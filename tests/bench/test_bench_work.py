@@ -20,7 +20,7 @@ from invgraphics.bench import (
 from invgraphics.bench.gates import gates
 from invgraphics.bench.results import BOTH, FORWARD, FORWARD_ONLY, SIZE_KEYS, Results
 from invgraphics.bench.run import BenchRequest, bench, measure_case
-from invgraphics.bench.timing import Effort
+from invgraphics.bench.timing import TimingBudget
 from invgraphics.fields.encodings.hash import HashConfig
 from invgraphics.fields.geometry import CPU_CHUNK
 from invgraphics.fields.neural import NeuralFieldConfig
@@ -40,7 +40,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
         (limits, "LOOKUPS", 64),
         (limits, "EXP2_PASSES", 2),
         (limits, "GATHER_BYTES", (1 << 10, 1 << 12)),
-        (run, "QUICK", Effort(0.0, 1, 1)),
+        (run, "QUICK", TimingBudget(0.0, 1, 1)),
     ):
         monkeypatch.setattr(module, name, value)
     limits.sgemm.cache_clear()
@@ -115,7 +115,7 @@ def test_whole_steps_are_measured_beside_their_part(monkeypatch) -> None:
     monkeypatch.setattr(iterations, "WARM_SAMPLES", 256)
     monkeypatch.setattr(iterations, "SAMPLES", 512)
     monkeypatch.setattr(iterations, "nerf_scene", lambda: workload.scene(workload.gaussian_field(200), 2, 16))
-    once = Effort(0.0, 1, 1)
+    once = TimingBudget(0.0, 1, 1)
     found = iterations.splat_step(100, 16, once) + iterations.nerf_step({"levels": 2, "log2_size": 5, "hidden": 8}, once)
     assert [m.operation for m in found] == [
         iterations.SPLAT_SHARE, iterations.SPLAT_STEP, iterations.NERF_SHARE, iterations.NERF_STEP,
@@ -218,7 +218,7 @@ def test_peers_that_are_missing_or_broken_are_named(monkeypatch) -> None:
     monkeypatch.setattr(peers, "_drjit", broken)
     monkeypatch.setattr(peers, "_mitsuba", absent)
     results = Results()
-    peers.peers(Effort(0.0, 1, 1), results)
+    peers.peers(TimingBudget(0.0, 1, 1), results)
     assert [(skipped.what, skipped.why) for skipped in results.skipped] == [
         ("nerfstudio (torch) hash encoding", "not installed"),
         ("Dr.Jit (LLVM) hash encoding", "it failed: ZeroDivisionError: division by zero"),
@@ -229,7 +229,7 @@ def test_peers_that_are_missing_or_broken_are_named(monkeypatch) -> None:
 
 def test_quick_runs_measure_what_promises_on_lattices_are_made_for(monkeypatch) -> None:
     monkeypatch.setattr("invgraphics.bench.run._CASES", {"lattice": lambda quick: iter(())})
-    monkeypatch.setattr("invgraphics.bench.run._effort", lambda request: Effort(0.0, 1, 1))
+    monkeypatch.setattr("invgraphics.bench.run._budget", lambda request: TimingBudget(0.0, 1, 1))
     monkeypatch.setattr("invgraphics.bench.run._measure_limits", lambda request, results: None)
     monkeypatch.setattr("invgraphics.bench.run.kernels.warm_up", lambda: None)
     found = [gate for gate in gates(bench(BenchRequest(("lattice",), quick=True))) if "lattice" in gate.name]

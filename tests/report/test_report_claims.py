@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader
 from made_up_runs import made_up_run
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Lost, Observation
+from invgraphics.report.data.factors import METHOD, FailedFit, Observation
 from invgraphics.report.figures.effects import draw_intervals
 from invgraphics.report.pages.tables import markdown_effects, write_latex_effects
 from invgraphics.report.statistics.effects import Effect, effects_of
@@ -181,7 +181,7 @@ def test_a_fit_lost_on_a_scene_does_not_help_its_method_there() -> None:
     missing = {("s0", "B"), ("s1", "A")}
     fits = fits_of(2, 5, lambda s, m: 25 + 2 * (m == "B") + rng.normal(0, 0.1))
     fits = [one for one in fits if (one.scene, one.levels[METHOD]) not in missing or one.run.seed]
-    effect = effect_of(A_TO_B, fits, *(Lost(scene, {METHOD: method}) for scene, method in missing))
+    effect = effect_of(A_TO_B, fits, *(FailedFit(scene, {METHOD: method}) for scene, method in missing))
     assert effect.lost == (1, 1) and not effect.flattered
     assert {scene: one.verdict for scene, one in effect.by_scene.items()} == {"s0": "undecided", "s1": "higher"}
 
@@ -193,7 +193,7 @@ def test_fits_lost_at_settings_make_no_opposite_signs() -> None:
     for views, loser in (("5", "16"), ("40", "8")):
         for seed, size in ((seed, size) for seed in range(5) for size in ("8", "16")):
             if size == loser and seed == 0:
-                lost.append(Lost("s", {METHOD: "m", "size": size, "views": views}))
+                lost.append(FailedFit("s", {METHOD: "m", "size": size, "views": views}))
             else:
                 fits.append(fit(20 + (size == loser) + rng.normal(0, 0.1), seed=seed, size=size, views=views))
     effect = effect_of(SIZE, fits, *lost)

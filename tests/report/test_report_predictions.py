@@ -11,7 +11,7 @@ from report_folders import PREDICTED
 from scipy import stats
 
 from invgraphics.errors import InputError
-from invgraphics.report.data.factors import Factor, Lost, Observation
+from invgraphics.report.data.factors import Factor, FailedFit, Observation
 from invgraphics.report.statistics.effects import contrasts_of, effects_of
 from invgraphics.report.statistics.predictions import PREDICTION_HEADS, judge_predictions, predictions_sentence
 from invgraphics.report.wording import quality_quantity
@@ -101,7 +101,7 @@ def test_nothing_is_claimed_from_one_seed_or_after_losses() -> None:
     assert single.verdict == "undecided"
     assert "no interval from 1 seed" in single.cells[-1]
     levels = {"method": SPLAT, N: "4", "field.init": "random"}
-    lost = [Lost("ball", levels), Lost("fog", levels), Lost("ball", levels | {"field.init": "stereo"})]
+    lost = [FailedFit("ball", levels), FailedFit("fog", levels), FailedFit("ball", levels | {"field.init": "stereo"})]
     (fewer,) = judge_predictions([held], fits(), lost)  # of the three, one is on the scene and of settings that were fitted
     assert (fewer.verdict, fewer.lost) == ("undecided", 1)
     assert judge_predictions([held], fits(), lost[1:])[0].verdict == "held"
@@ -288,7 +288,7 @@ def test_a_prediction_for_all_scenes_is_about_those_without_fits_too() -> None:
     assert judge_predictions([BETTER], made, scenes=scenes[:3])[0].verdict == "held"
     (missing,) = judge_predictions([BETTER], made, scenes=scenes)
     assert (missing.verdict, missing.reason) == ("undecided", "no fits of all sides on s3")
-    lost = [Lost("s3", {"method": method, N: "4"}) for method in (SPLAT, EXACT)]
+    lost = [FailedFit("s3", {"method": method, N: "4"}) for method in (SPLAT, EXACT)]
     (failed,) = judge_predictions([BETTER], made, lost, scenes)
     assert (failed.verdict, failed.lost) == ("undecided", 2)
 

@@ -11,7 +11,7 @@ import pytest
 from made_up_runs import made_up_run
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
+from invgraphics.report.data.factors import METHOD, Factor, FailedFit, Observation
 from invgraphics.report.statistics.effects import Effect, contrasts_of, effects_of
 from invgraphics.report.statistics.leaders import lead_contrasts
 from invgraphics.report.statistics.pairing import Contrast
@@ -44,7 +44,7 @@ def observe(shape: tuple[int, int], values: Values, factor: Factor = METHODS, **
     return found
 
 
-def effect_of(shape: tuple[int, int], values: Values, factor: Factor = METHODS, lost: tuple[Lost, ...] = ()) -> Effect:
+def effect_of(shape: tuple[int, int], values: Values, factor: Factor = METHODS, lost: tuple[FailedFit, ...] = ()) -> Effect:
     (effect,) = effects_of(contrasts_of([factor]), PSNR, observe(shape, values, factor), lost)
     return effect
 
@@ -160,7 +160,7 @@ def test_a_fit_that_diverges_never_helps_its_method() -> None:
     kept = effect_of((1, 5), survives)
     assert kept.estimate.p is not None and kept.estimate.p < 0.01
     assert not kept.found and "Diverged or failed" in effect_sentence(kept) and "gains" not in effect_sentence(kept)
-    failed = tuple(Lost("scene-0", {METHOD: B}) for _ in range(1))
+    failed = tuple(FailedFit("scene-0", {METHOD: B}) for _ in range(1))
     assert not effect_of((1, 5), lambda s, k, level: 25 + 3 * (level == B) + rng.normal(0, 0.1), lost=failed).found
     worse = effect_of((1, 5), lambda s, k, level: nan if level == B and k == 0 else 25 - 3 * (level == B) + rng.normal(0, 0.1))
     assert worse.found and worse.estimate.mean < 0
@@ -313,10 +313,11 @@ def test_fits_that_a_comparison_does_not_use_are_not_lost_to_it() -> None:
     rng = np.random.default_rng(18)
     a, b = ONE_AT_A_TIME
     observations = observe((1, 4), lambda s, k, level: 20 - 0.5 * (level == "1") + rng.normal(0, 0.05), a, **{b.path: "0"})
-    lost = [Lost("scene-0", {METHOD: "m", a.path: "0", b.path: "1"}) for _ in range(4)]
+    lost = [FailedFit("scene-0", {METHOD: "m", a.path: "0", b.path: "1"}) for _ in range(4)]
     whole, disturbed = (effects_of([Contrast(a.path, "0", "1")], PSNR, observations, gone)[0] for gone in ([], lost))
     assert disturbed == whole and whole.found and whole.lost == (0, 0)
-    (own,) = effects_of([Contrast(a.path, "0", "1")], PSNR, observations, [Lost("scene-0", lost[0].levels | {b.path: "0"})])
+    of_base = FailedFit("scene-0", lost[0].levels | {b.path: "0"})
+    (own,) = effects_of([Contrast(a.path, "0", "1")], PSNR, observations, [of_base])
     assert own.lost == (1, 0) and not own.found and own.flattered  # the base, which looks better, has lost one
 
 
@@ -331,8 +332,8 @@ def test_losses_at_a_corner_flatter_an_interaction_by_its_sign_there(corner: tup
         more = gain if level == "1" else 0.0
         made = observe((1, 8), lambda s, k, t, m=more: 20 + m * (t == "1") + rng.normal(0, 0.05), a, **{b.path: level})
         observations += [one for one in made if (one.levels[a.path], level) != corner or one.run.seed > 2]
-    lost = [Lost("scene-0", {METHOD: "m", a.path: corner[0], b.path: corner[1]}) for _ in range(3)]
-    elsewhere = [Lost("scene-0", {METHOD: "m", a.path: "2", b.path: corner[1]})]
+    lost = [FailedFit("scene-0", {METHOD: "m", a.path: corner[0], b.path: corner[1]}) for _ in range(3)]
+    elsewhere = [FailedFit("scene-0", {METHOD: "m", a.path: "2", b.path: corner[1]})]
     effect = effects_of([Contrast(a.path, "0", "1", against=(b.path, "0", "1"))], PSNR, observations, [*lost, *elsewhere])[0]
     assert effect.lost == ((0, 3) if raises else (3, 0))
     assert effect.flattered == ((gain > 0) == bool(raises)) and effect.found != effect.flattered
@@ -386,7 +387,7 @@ def test_settings_are_one_family_over_all_comparisons() -> None:
 MANY = Factor(METHOD, tuple("abcdefg"), "a")
 
 
-def lead_of(shape: tuple[int, int], values: Values, factor: Factor = MANY, lost: tuple[Lost, ...] = ()) -> Effect | None:
+def lead_of(shape: tuple[int, int], values: Values, factor: Factor = MANY, lost: tuple[FailedFit, ...] = ()) -> Effect | None:
     """The best level against the next, in one family with the comparisons of all with the first."""
     observations = observe(shape, values, factor)
     leads = lead_contrasts([factor], PSNR, observations, lost)
@@ -407,7 +408,8 @@ def test_the_best_of_many_methods_is_tested_against_the_next() -> None:
     assert level is not None and {level.before, level.after} == {"c", "g"} and not level.found
     gains["a"] = 4.5  # the reference is second, and so compared with the best already
     assert lead_of((4, 3), lambda s, k, level: hard[s] + gains[level] + rng.normal(0, 0.1)) is None
-    broken = lead_of((1, 3), lambda s, k, level: gains[level] - 4.5 * (level == "a"), lost=(Lost("scene-0", {METHOD: "c"}),))
+    lost = (FailedFit("scene-0", {METHOD: "c"}),)
+    broken = lead_of((1, 3), lambda s, k, level: gains[level] - 4.5 * (level == "a"), lost=lost)
     assert broken is not None and (broken.before, broken.after) == ("b", "g"), "a level that lost a fit is not ranked"
     few = Factor(METHOD, tuple("abcd"), "a")
     assert not lead_contrasts([few], PSNR, observe((1, 3), lambda s, k, level: gains[level], few)), "all pairs are compared"

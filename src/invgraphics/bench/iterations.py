@@ -13,7 +13,7 @@ from typing_extensions import override
 from invgraphics.bench.results import BOTH, Measurement
 from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
 from invgraphics.bench.splat_cases import forward_backward, splat_pipeline
-from invgraphics.bench.timing import Effort, alternate
+from invgraphics.bench.timing import TimingBudget, alternate
 from invgraphics.bench.workload import activated, gaussian_field, leaves, scene
 from invgraphics.core import Model, Scene, harmonics
 from invgraphics.fields.encodings.hash import HashConfig
@@ -48,7 +48,7 @@ REFRESH = 16
 """Steps between updates of the occupancy grid; one timed call makes as many, so that each includes one update."""
 
 
-def splat_step(n: int, width: int, effort: Effort) -> list[Measurement]:
+def splat_step(n: int, width: int, budget: TimingBudget) -> list[Measurement]:
     """Training step of splatting (render, 0.8 L1 + 0.2 SSIM, fused Adam) against project, bin, rasterise on the same views."""
     field = gaussian_field(n)
     pictures = scene(field, VIEWS, width)
@@ -62,7 +62,7 @@ def splat_step(n: int, width: int, effort: Effort) -> list[Measurement]:
     def draw_next() -> object:
         return next(views)()
 
-    timings = alternate({SPLAT_SHARE: draw_next, SPLAT_STEP: fit.step}, effort)
+    timings = alternate({SPLAT_SHARE: draw_next, SPLAT_STEP: fit.step}, budget)
     sizes, threads = {"gaussians": n, "width": width}, torch.get_num_threads()
     return [Measurement(name, "numba", BOTH, sizes, threads, timing, float(n), "Gaussians") for name, timing in timings.items()]
 
@@ -129,14 +129,14 @@ def nerf_fit(pictures: Scene, levels: int, log2_size: int, hidden: int, warm_ste
     return NerfFit(_fit(model, pictures, losses, [counter], batches, lr=1e-2), field, counter)
 
 
-def nerf_step(sizes: dict[str, int], effort: Effort) -> list[Measurement]:
+def nerf_step(sizes: dict[str, int], budget: TimingBudget) -> list[Measurement]:
     """Training step of a hash grid (march, encode, networks, composite, Adam) against its two networks alone."""
     running = nerf_fit(nerf_scene(), **sizes, warm_steps=WARM_STEPS)
     running.refresh_cycle()  # in which the number of rays adapts
     counted, rays = running.counter.samples, running.counter.rays
     counted.clear()
     rays.clear()
-    timings = alternate({NERF_SHARE: networks_alone(running.field, SAMPLES), NERF_STEP: running.refresh_cycle}, effort)
+    timings = alternate({NERF_SHARE: networks_alone(running.field, SAMPLES), NERF_STEP: running.refresh_cycle}, budget)
     per_step = sum(counted) / len(counted)
     note = f"{per_step:.0f} samples on {sum(rays) / len(rays):.0f} rays per step"
     threads, step = torch.get_num_threads(), timings[NERF_STEP].per(REFRESH)
@@ -182,9 +182,9 @@ def _fit(
     return Fit(Plan(model, pictures, losses, hooks, optimiser, batches, Budget(steps=ALL_STEPS)))
 
 
-def steps(quick: bool, effort: Effort) -> list[Measurement]:
+def steps(quick: bool, budget: TimingBudget) -> list[Measurement]:
     """All training steps: the gated sizes, and in a full run smaller ones."""
-    found = splat_step(SPLAT_GATE["gaussians"], SPLAT_GATE["width"], effort) + nerf_step(NERF_GATE, effort)
+    found = splat_step(SPLAT_GATE["gaussians"], SPLAT_GATE["width"], budget) + nerf_step(NERF_GATE, budget)
     if not quick:
-        found += splat_step(10_000, 200, effort) + nerf_step(NERF_SMALL, effort)
+        found += splat_step(10_000, 200, budget) + nerf_step(NERF_SMALL, budget)
     return found

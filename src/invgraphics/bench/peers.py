@@ -22,7 +22,7 @@ from invgraphics.bench.sample_cases import BASE, FINEST, ray_ordered
 from invgraphics.bench.sample_cases import GATE as HASH_GATE
 from invgraphics.bench.splat_cases import GATE as SPLAT_GATE
 from invgraphics.bench.splat_cases import forward_backward, splat_pipeline, without_gradient
-from invgraphics.bench.timing import Effort, Timing, alternate
+from invgraphics.bench.timing import Timing, TimingBudget, alternate
 from invgraphics.bench.workload import activated, camera, gaussian_field
 from invgraphics.core.ngp import HashGrid
 
@@ -37,7 +37,7 @@ class MissingError(Exception):
     """A peer is not available here; the message says why."""
 
 
-def peers(effort: Effort, results: Results) -> None:
+def peers(budget: TimingBudget, results: Results) -> None:
     """Time installed peers in alternation with our kernels; record why others are skipped."""
     ours = kernels.in_use()
     encoders: dict[str, dict[str, Run]] = {ours: _our_hash()}
@@ -45,14 +45,14 @@ def peers(effort: Effort, results: Results) -> None:
         _add(encoders, f"{name} hash encoding", name, make, results)
     look_ups = 8.0 * HASH_GATE["levels"] * HASH_GATE["points"]
     for direction, passes in ((FORWARD, 1), (BOTH, 2)):
-        timings = alternate({name: runs[direction] for name, runs in encoders.items()}, effort)
+        timings = alternate({name: runs[direction] for name, runs in encoders.items()}, budget)
         results.measurements += [
             _row(f"{PEERS}: hash encoding", name, direction, HASH_GATE, timing, passes * look_ups, "look-ups")
             for name, timing in timings.items()
         ]
     pictures: dict[str, dict[str, Run]] = {ours: _our_splats()}
     _add(pictures, "Mitsuba's volprim_rf_basic", "Mitsuba (ray traced)", _mitsuba, results)
-    timings = alternate({name: runs[FORWARD] for name, runs in pictures.items()}, effort)
+    timings = alternate({name: runs[FORWARD] for name, runs in pictures.items()}, budget)
     pixels = float(SPLAT_GATE["width"] ** 2)
     results.measurements += [
         _row(f"{PEERS}: picture of Gaussians", name, FORWARD, SPLAT_GATE, timing, pixels, "pixels")
@@ -60,13 +60,13 @@ def peers(effort: Effort, results: Results) -> None:
     ]
 
 
-def lattice_peers(effort: Effort, results: Results) -> None:
+def lattice_peers(budget: TimingBudget, results: Results) -> None:
     """Time torch's grid sampler in alternation with `kernels.lattice_encode`, on the layouts that promises are made for."""
     ours = kernels.in_use()
     for name, layout in LAYOUTS.items():
         samplers = {ours: lattice_cases.ours(layout, GATE_POINTS), TORCH: torch_sampler(layout, GATE_POINTS)}
         for direction in (FORWARD, BOTH):
-            timings = alternate({who: runs[direction] for who, runs in samplers.items()}, effort)
+            timings = alternate({who: runs[direction] for who, runs in samplers.items()}, budget)
             results.measurements += [
                 _row(f"{PEERS}: {name}", who, direction, layout.sizes(GATE_POINTS), timing, float(GATE_POINTS), "points")
                 for who, timing in timings.items()

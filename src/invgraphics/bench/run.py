@@ -13,13 +13,13 @@ from invgraphics.bench.case import Case
 from invgraphics.bench.memory import measure_memory
 from invgraphics.bench.peers import lattice_peers, peers
 from invgraphics.bench.results import BOTH, FORWARD_ONLY, MACHINE, THREADS, Measurement, Results, Skipped
-from invgraphics.bench.timing import Effort, alternate
+from invgraphics.bench.timing import TimingBudget, alternate
 from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.dispatch import IMPLEMENTATIONS, cpu_implementations, unavailable_reason
 
-QUICK, FULL = Effort(0.4, 2, 9), Effort(0.6, 3, 15)
+QUICK, FULL = TimingBudget(0.4, 2, 9), TimingBudget(0.6, 3, 15)
 """Measurement budget of each kernel variant."""
-STEPS_QUICK, STEPS_FULL = Effort(2.0, 2, 9), Effort(4.0, 3, 15)
+STEPS_QUICK, STEPS_FULL = TimingBudget(2.0, 2, 9), TimingBudget(4.0, 3, 15)
 """Measurement budget of each training step."""
 
 _CASES: dict[str, Callable[[bool], Iterator[Case]]] = {
@@ -79,7 +79,7 @@ def bench(request: BenchRequest) -> Results:
 def _measure_limits(request: BenchRequest, results: Results) -> None:
     request.progress("limits of the machine")
     for limit in limits.all_limits():
-        timing = alternate({"": limit.run}, _effort(request))[""]
+        timing = alternate({"": limit.run}, _budget(request))[""]
         sizes, threads = limit.sizes, torch.get_num_threads()
         results.measurements.append(Measurement(limit.name, MACHINE, "", sizes, threads, timing, limit.amount, limit.unit))
 
@@ -91,7 +91,7 @@ def _measure_part(part: str, request: BenchRequest, results: Results) -> None:
             results.measurements += measure_case(case, request, results.skipped)
         if part == "lattice" and "numba" in request.implementations:  # promises are about this ratio, in quick runs too
             request.progress("torch's grid sampler")
-            lattice_peers(_effort(request), results)
+            lattice_peers(_budget(request), results)
     elif part == "threads":
         _measure_threads(request, results)
     elif "numba" not in request.implementations:
@@ -104,7 +104,7 @@ def _measure_part(part: str, request: BenchRequest, results: Results) -> None:
         measure_memory(request.implementations, results)
     elif part == "peers":
         request.progress("peers")
-        peers(_effort(request), results)
+        peers(_budget(request), results)
 
 
 def measure_case(case: Case, request: BenchRequest, skipped: list[Skipped]) -> list[Measurement]:
@@ -119,7 +119,7 @@ def measure_case(case: Case, request: BenchRequest, skipped: list[Skipped]) -> l
         variants = {name: _with_kernels(name, work.run) for name in names}
         if work.limit:
             variants[MACHINE] = work.limit.run
-        timings = alternate(variants, _effort(request))
+        timings = alternate(variants, _budget(request))
         rate = work.limit.amount / timings[MACHINE].median if work.limit else 0.0
         label, threads = work.limit.name if work.limit else "", torch.get_num_threads()
         found += [
@@ -141,7 +141,7 @@ def _with_kernels(name: str, run: Callable[[], object]) -> Callable[[], object]:
     return forced
 
 
-def _effort(request: BenchRequest) -> Effort:
+def _budget(request: BenchRequest) -> TimingBudget:
     return QUICK if request.quick else FULL
 
 

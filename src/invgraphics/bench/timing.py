@@ -30,7 +30,7 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class Effort:
+class TimingBudget:
     """Measurement budget of a variant.
 
     Attributes:
@@ -55,18 +55,18 @@ def clock(work: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
-def alternate(variants: Mapping[str, Callable[[], object]], effort: Effort) -> dict[str, Timing]:
+def alternate(variants: Mapping[str, Callable[[], object]], budget: TimingBudget) -> dict[str, Timing]:
     """Time variants in alternation: A B C A B C ... The first round warms caches and is discarded, except for variants whose
     single call exceeds the budget.
 
     A variant that has had its repetitions drops out.
     """
     first = {name: clock(work) for name, work in variants.items()}
-    seconds: dict[str, list[float]] = {name: [taken] if taken >= effort.seconds else [] for name, taken in first.items()}
+    seconds: dict[str, list[float]] = {name: [taken] if taken >= budget.seconds else [] for name, taken in first.items()}
     for name, work in variants.items():
         if not seconds[name]:
             seconds[name].append(clock(work))
-    wanted = {name: effort.repetitions(taken[0]) for name, taken in seconds.items()}
+    wanted = {name: budget.repetitions(taken[0]) for name, taken in seconds.items()}
     for turn in range(1, max(wanted.values(), default=0)):
         for name, work in variants.items():
             if turn < wanted[name]:

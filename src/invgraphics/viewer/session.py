@@ -16,6 +16,7 @@ from invgraphics.core import Scene
 from invgraphics.experiments.evaluate import display
 from invgraphics.tools.camera_path import CameraPath, Keyframe
 from invgraphics.tools.colorize import NEEDS_TRUTH
+from invgraphics.viewer.camera_move import CameraMove
 from invgraphics.viewer.cameras import (
     LetterboxedView,
     ViewerCamera,
@@ -28,7 +29,6 @@ from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Con
 from invgraphics.viewer.crop import crop_note
 from invgraphics.viewer.crop_panel import CropPanel
 from invgraphics.viewer.film_export import RATE, FilmLook, export_film, film_cameras
-from invgraphics.viewer.journey import Journey
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.overlays import Overlays
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
@@ -57,7 +57,7 @@ class Session:
         path = PathCallbacks(self._keyframe, self._move_to, self._export, self._stop_export, self._download)
         self._path = PathPanel(client.gui, client.scene, self._scene, path)
         self._view_index: int | None = None
-        self._journey: Journey | None = None
+        self._move: CameraMove | None = None
         self._requested: tuple[int | None, float] | None = None
         self._sent_at = 0.0
         self._overlays = Overlays(client.scene, shared.renderer.runs[0], shared.frustums, self._frustum_clicked)
@@ -78,7 +78,7 @@ class Session:
         """Move the camera to a photograph's."""
         name, view = self._shared.views[index]
         self._view_index = index
-        self._journey = Journey(self._camera.pose, view.camera.cam_to_world, self._scene.extent, time.monotonic())
+        self._move = CameraMove(self._camera.pose, view.camera.cam_to_world, self._scene.extent, time.monotonic())
         self._controls.view.value = name
         self._set_camera(view.camera.cam_to_world, self._letterbox().fov)
         self._submit("overlays", self._update_overlays())
@@ -148,7 +148,7 @@ class Session:
         if camera.update_timestamp == self._sent_at:
             return
         if self._view_index is not None:
-            if self._journey is not None and self._journey.has_left(self._camera, time.monotonic()):
+            if self._move is not None and self._move.has_left(self._camera, time.monotonic()):
                 self._view_index, self._notice = None, ""
                 self._controls.view.value = FREE_CAMERA
                 self._submit("overlays", self._update_overlays())

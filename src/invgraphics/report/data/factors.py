@@ -61,7 +61,7 @@ class Observation:
 
 
 @dataclass(frozen=True)
-class Lost:
+class FailedFit:
     """A fit that failed, with its scene and its level of every factor; it has no scores, and that must not help its method."""
 
     scene: str

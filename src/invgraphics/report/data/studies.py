@@ -9,7 +9,7 @@ from typing import Any
 
 from invgraphics.errors import InputError
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation, StudyCell
+from invgraphics.report.data.factors import METHOD, Factor, FailedFit, Observation, StudyCell
 from invgraphics.report.data.variants import find_factors, variant_name
 from invgraphics.runs.comparison import Failure
 from invgraphics.runs.environment import Environment
@@ -95,9 +95,9 @@ class Study:
         """Finished runs with their factor levels."""
         return tuple(Observation(cell.run, cell.scene, cell.levels) for cell in self.cells if cell.run is not None)
 
-    def lost(self) -> tuple[Lost, ...]:
+    def lost(self) -> tuple[FailedFit, ...]:
         """Failed fits with their factor levels."""
-        return tuple(Lost(cell.scene, cell.levels) for cell in self.failures)
+        return tuple(FailedFit(cell.scene, cell.levels) for cell in self.failures)
 
 
 def is_study(folder: Path) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from invgraphics.report.data.assets import Folder
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import METHOD, Factor, Lost, Observation
+from invgraphics.report.data.factors import METHOD, Factor, FailedFit, Observation
 from invgraphics.report.figures.curves import draw_curves
 from invgraphics.report.figures.distributions import draw_distributions
 from invgraphics.report.figures.effects import draw_intervals
@@ -173,7 +173,7 @@ def draw_part(comparison: Comparison, folder: Folder, approximations: Sequence[A
 def draw_contrasts(
     quantities: Sequence[MeasuredQuantity],
     contrasts: Sequence[Contrast],
-    observed: tuple[Sequence[Observation], Sequence[Lost]],
+    observed: tuple[Sequence[Observation], Sequence[FailedFit]],
     folder: Folder,
     factors: Sequence[Factor] = (),
 ) -> Contrasts:
@@ -199,7 +199,7 @@ def method_contrasts(comparison: Comparison, folder: Folder) -> Contrasts:
     if len(methods) < 2 or len({run.seed for run in comparison.runs}) < 2:
         return Contrasts((), None)
     runs = [Observation(run, comparison.scene, {METHOD: run.method}) for run in comparison.runs]
-    lost = [Lost(comparison.scene, {METHOD: failure.method}) for failure in comparison.failures]
+    lost = [FailedFit(comparison.scene, {METHOD: failure.method}) for failure in comparison.failures]
     pairs = contrasts_of([Factor(METHOD, methods, methods[0])])
     return draw_contrasts(quality_columns(comparison), pairs, (runs, lost), folder)
 

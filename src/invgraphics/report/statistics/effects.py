@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from invgraphics.report.data.factors import Factor, Lost, Observation
+from invgraphics.report.data.factors import Factor, FailedFit, Observation
 from invgraphics.report.statistics.clocks import disturbed_fits
 from invgraphics.report.statistics.intervals import Estimate, holm
 from invgraphics.report.statistics.pairing import Contrast, contrast_words, sample
@@ -232,7 +232,7 @@ def effects_of(
     contrasts: Sequence[Contrast],
     quantity: MeasuredQuantity,
     observations: Sequence[Observation],
-    lost: Iterable[Lost] = (),
+    lost: Iterable[FailedFit] = (),
     factors: Sequence[Factor] = (),
 ) -> list[Effect]:
     """Effects of given contrasts on one quantity, corrected as one family (Holm 1979).
@@ -275,7 +275,7 @@ def effects_of(
 def _effect(
     contrast: Contrast,
     quantity: MeasuredQuantity,
-    observed: tuple[Sequence[Observation], Sequence[Lost]],
+    observed: tuple[Sequence[Observation], Sequence[FailedFit]],
     factors: Sequence[Factor],
 ) -> Effect | None:
     values = sample(contrast, quantity, *observed)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from invgraphics.report.data.comparison import Comparison
-from invgraphics.report.data.factors import ALL_PAIRS, METHOD, Factor, Lost, Observation
+from invgraphics.report.data.factors import ALL_PAIRS, METHOD, Factor, FailedFit, Observation
 from invgraphics.report.statistics.effects import ALPHA, Effect, effects_of, places_of
 from invgraphics.report.statistics.intervals import holm
 from invgraphics.report.statistics.pairing import Contrast, contrast_words
@@ -50,7 +50,7 @@ def lead_contrasts(
     factors: Sequence[Factor],
     quantity: MeasuredQuantity,
     observations: Sequence[Observation],
-    lost: Iterable[Lost] = (),
+    lost: Iterable[FailedFit] = (),
     places: tuple[str, Sequence[str]] = ("", ()),
 ) -> list[Contrast]:
     """Best level against the next best, of factors with too many levels for all pairs, in the family of a study's comparisons.

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from invgraphics.report.data.factors import METHOD, Lost, Observation
+from invgraphics.report.data.factors import METHOD, FailedFit, Observation
 from invgraphics.report.data.variants import level_words
+from invgraphics.report.statistics.failures import failures_among, scoreless
 from invgraphics.report.statistics.intervals import Estimate, over_scenes, over_seeds
-from invgraphics.report.statistics.losses import lost_among, scoreless
 from invgraphics.report.statistics.values import run_values, value_of
 from invgraphics.report.wording import MeasuredQuantity
 
@@ -70,7 +70,7 @@ class Contrast:
         """Whether the two sides are independent groups of fits: different methods, whose seeds do not pair."""
         return METHOD in (self.factor, self.against[0] if self.against else "")
 
-    def takes(self, one: Observation | Lost) -> bool:
+    def takes(self, one: Observation | FailedFit) -> bool:
         """Whether a fit is at the levels of one of its sides."""
         included = all(one.levels.get(key) == level for key, level in self.where.items())
         return included and any(all(one.levels.get(key) == level for key, level in side.items()) for side in self.sides)
@@ -123,7 +123,7 @@ class Sample:
 
     @property
     def all_lost(self) -> tuple[int, int]:
-        """Lost fits of all scenes that are (subtracted, added)."""
+        """Failed fits of all scenes that are (subtracted, added)."""
         return sum(one for one, _ in self.lost.values()), sum(one for _, one in self.lost.values())
 
 
@@ -132,7 +132,7 @@ Table = dict[tuple[Any, ...], dict[int, Observation]]
 
 
 def sample(
-    contrast: Contrast, quantity: MeasuredQuantity, observations: Sequence[Observation], lost: Iterable[Lost] = ()
+    contrast: Contrast, quantity: MeasuredQuantity, observations: Sequence[Observation], lost: Iterable[FailedFit] = ()
 ) -> Sample:
     """Collect the values of a contrast from a study's runs.
 
@@ -145,11 +145,11 @@ def sample(
     counted = [one for one in observations if all(one.levels.get(key) == level for key, level in contrast.where.items())]
     sided = [one for one in counted if one.levels.get(contrast.factor, "") in contrast.levels]
     failed = scoreless(sided, quantity)
-    gone = [Lost(one.scene, one.levels) for one in failed]
+    gone = [FailedFit(one.scene, one.levels) for one in failed]
     left_out = set(map(id, failed))
     known = [one for one in sided if id(one) not in left_out and value_of(one.run, quantity) is not None]
     gone += [cell for cell in lost if all(cell.levels.get(key) == value for key, value in contrast.where.items())]
-    gone = lost_among(gone, known, contrast.sides)
+    gone = failures_among(gone, known, contrast.sides)
     differ = False
     scenes: dict[str, list[tuple[Sign, ndarray]]] = {}
     pairs = 0
@@ -169,13 +169,13 @@ def sample(
     return Sample(scenes, losses, silent, pairs, differ, scores)
 
 
-def _counted(contrast: Contrast, gone: Sequence[Lost]) -> tuple[int, int]:
+def _counted(contrast: Contrast, gone: Sequence[FailedFit]) -> tuple[int, int]:
     """Numbers of lost fits that are (subtracted, added)."""
     raised = sum(_raises(contrast, cell) for cell in gone)
     return len(gone) - raised, raised
 
 
-def _raises(contrast: Contrast, cell: Lost) -> bool:
+def _raises(contrast: Contrast, cell: FailedFit) -> bool:
     """Whether losing a fit may raise the estimate, as the worst go first: those that are added, not those subtracted."""
     added = cell.levels.get(contrast.factor) == contrast.after
     if contrast.against is None:

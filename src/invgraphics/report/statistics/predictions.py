@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from invgraphics.report.data.factors import METHOD, Lost, Observation
+from invgraphics.report.data.factors import METHOD, FailedFit, Observation
+from invgraphics.report.statistics.failures import failures_among, scoreless
 from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate, Groups, over_scenes, over_seeds
-from invgraphics.report.statistics.losses import lost_among, scoreless
 from invgraphics.report.statistics.pairing import balanced
 from invgraphics.report.statistics.values import diverged, run_values, value_of
 from invgraphics.report.wording import ABSENT, MeasuredQuantity, listing, quality_quantity, significant_decimals
@@ -87,7 +87,7 @@ class JudgedPrediction:
 def judge_predictions(
     predictions: Sequence[Prediction],
     observations: Sequence[Observation],
-    lost: Iterable[Lost] = (),
+    lost: Iterable[FailedFit] = (),
     scenes: Sequence[str] = (),
 ) -> list[JudgedPrediction]:
     """Judge each prediction by a study's finished runs and failed fits, those without scenes on all of its own."""
@@ -103,7 +103,7 @@ def predictions_sentence(judged: Sequence[JudgedPrediction]) -> str:
 
 
 def _judge(
-    prediction: Prediction, observations: Sequence[Observation], failures: Sequence[Lost], names: Sequence[str]
+    prediction: Prediction, observations: Sequence[Observation], failures: Sequence[FailedFit], names: Sequence[str]
 ) -> JudgedPrediction:
     scored = [one for one in observations if prediction.metric in one.run.scores.quality]
     if not scored:
@@ -116,8 +116,8 @@ def _judge(
     size = max((abs(score) for one in scored if math.isfinite(score := value_of(one.run, quantity) or 0.0)), default=0.0)
     value = over_seeds(list(known.values()), scores=size)
     gone = [one for one in failures if one.scene in names]
-    gone += [Lost(one.scene, one.levels) for one in scoreless(observations, quantity) if one.scene in names]
-    count = len(lost_among(gone, [one for one in scored if one.scene in names], [levels for _, levels in terms]))
+    gone += [FailedFit(one.scene, one.levels) for one in scoreless(observations, quantity) if one.scene in names]
+    count = len(failures_among(gone, [one for one in scored if one.scene in names], [levels for _, levels in terms]))
     if value is None:
         reason = "; ".join(dict.fromkeys(why for _, why in found.values()))
         return JudgedPrediction(prediction, quantity, None, (), count, "open", reason)

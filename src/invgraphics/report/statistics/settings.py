@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from invgraphics.report.data.factors import Factor, Lost, Observation
+from invgraphics.report.data.factors import Factor, FailedFit, Observation
 from invgraphics.report.data.variants import setting_words
 from invgraphics.report.statistics.intervals import CONFIDENCE, Estimate
 from invgraphics.report.statistics.pairing import Contrast, sample
@@ -84,12 +84,12 @@ def effects_by_setting(
     contrast: Contrast,
     quantity: MeasuredQuantity,
     observations: Sequence[Observation],
-    lost: Sequence[Lost],
+    lost: Sequence[FailedFit],
     factors: Sequence[Factor],
 ) -> dict[str, SettingEffect]:
     """A contrast at each combination of other factors' levels, in words, uncorrected; empty where there is one only."""
 
-    def others(one: Observation | Lost) -> dict[str, str]:
+    def others(one: Observation | FailedFit) -> dict[str, str]:
         return {key: level for key, level in one.levels.items() if key != contrast.factor}
 
     settings = [] if contrast.against is not None else _settings_of(contrast, observations)

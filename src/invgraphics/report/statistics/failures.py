@@ -1,11 +1,11 @@
-"""Fits that a comparison lost: they failed, or diverged, and what is left of their side must not look better for it."""
+"""Failed and diverged fits of a comparison: what is left of their side must not look better for it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from invgraphics.report.data.factors import Lost, Observation
+from invgraphics.report.data.factors import FailedFit, Observation
 from invgraphics.report.statistics.values import without_score
 from invgraphics.report.wording import MeasuredQuantity
 
@@ -22,8 +22,10 @@ def scoreless(observations: Sequence[Observation], quantity: MeasuredQuantity) -
     return found
 
 
-def lost_among(gone: Sequence[Lost], known: Sequence[Observation], sides: Sequence[Mapping[str, str]]) -> list[Lost]:
-    """The lost fits at some sides' levels whose scene and other levels all sides have, lost or not: others are not missing.
+def failures_among(
+    gone: Sequence[FailedFit], known: Sequence[Observation], sides: Sequence[Mapping[str, str]]
+) -> list[FailedFit]:
+    """The failed fits at some sides' levels whose scene and other levels all sides have, failed or not: others are not missing.
 
     Args:
         gone: fits that failed or diverged.
@@ -32,10 +34,10 @@ def lost_among(gone: Sequence[Lost], known: Sequence[Observation], sides: Sequen
     """
     named = {factor for side in sides for factor in side}
 
-    def stratum(one: Lost | Observation) -> tuple[Any, ...]:
+    def stratum(one: FailedFit | Observation) -> tuple[Any, ...]:
         return one.scene, *sorted((key, level) for key, level in one.levels.items() if key not in named)
 
-    def at(one: Lost | Observation, side: Mapping[str, str]) -> bool:
+    def at(one: FailedFit | Observation, side: Mapping[str, str]) -> bool:
         return all(one.levels.get(factor) == level for factor, level in side.items())
 
     common = set.intersection(*({stratum(one) for one in (*known, *gone) if at(one, side)} for side in sides))

@@ -1,4 +1,4 @@
-"""Journey of a browser's camera to a photograph: separates late reports from a camera that was moved away."""
+"""Move of a browser's camera to a photograph: separates late reports from a camera that was moved away."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ARRIVAL = 10.0
 
 
 @dataclass
-class Journey:
+class CameraMove:
     """A camera sent to ``destination`` at time ``start`` (seconds), from ``departure``.
 
     A busy browser goes on reporting its old camera until it gets the new one, so that before arrival a report from the place
