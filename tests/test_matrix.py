@@ -50,15 +50,21 @@ def matching(renderer: str, field: Any) -> dict[str, int]:
     return {"features": field.feature_width} if takes and field.feature_width else {}
 
 
+def in_turn(encoding: str) -> list[str]:
+    """Two samplers for an encoding: a sampler asks a field for density or distance, whatever its encoding is."""
+    place = ENCODINGS.index(encoding)
+    return [SAMPLERS[(place + step) % len(SAMPLERS)] for step in (0, len(SAMPLERS) // 2)]
+
+
 def variants(scene: Scene) -> Iterator[tuple[str, Any, str, Any]]:
-    """A small neural field of every encoding and geometry, with every renderer of densities or distances and every sampler."""
+    """A small neural field of every encoding and geometry, with every renderer of densities or distances; samplers in turn."""
     small = {"layers": 1, "width": 16, "skip": -1, "colour_layers": 1, "colour_width": 16, "geometry_features": 7}
-    for encoding, geometry in product(plugins.names("encodings"), ("density", "sdf")):
+    for encoding, geometry in product(ENCODINGS, ("density", "sdf")):
         name = f"neural/{encoding}/{geometry}"
         field = build("fields", "neural", scene, encoding=plugins.load("encodings", encoding)(), geometry=geometry, **small)
         perturb(field)
         yield name, field, "sphere_tracing", build("renderers", "sphere_tracing", scene)
-        for sampler, renderer in product(SAMPLERS, ("volumetric", "volsdf", "neus")):
+        for sampler, renderer in product(in_turn(encoding), ("volumetric", "volsdf", "neus")):
             look = replace(plugins.load("samplers", sampler)(), **FEW.get(sampler, {}))
             yield name, field, f"{renderer}/{sampler}", build("renderers", renderer, scene, sampler=look)
 
@@ -102,12 +108,15 @@ def test_every_pair_draws_or_refuses_with_a_sentence(scene: Scene) -> None:
     assert {name for name, _ in drawn} >= set(FIELDS) - {"density"}
     # With their defaults, renderers of distances meet no field of distances.
     assert {name.partition("/")[0] for _, name in drawn} >= set(RENDERERS)
-    assert ("neural/hash/density", "volumetric/occupancy") in drawn
     assert {("gaussians", "splatting"), ("gaussians", "volumetric")} <= drawn
-    assert {("neural", "splatting"), ("neural/hash/sdf", "volumetric/stratified")} <= refused
+    assert ("neural", "splatting") in refused
+    for renderer, wanted, other in (("volumetric", "density", "sdf"), ("volsdf", "sdf", "density"), ("neus", "sdf", "density")):
+        pairs = {(encoding, f"{renderer}/{sampler}") for encoding in ENCODINGS for sampler in in_turn(encoding)}
+        assert {name.partition("/")[2] for _, name in pairs} == set(SAMPLERS)
+        assert {(f"neural/{encoding}/{wanted}", name) for encoding, name in pairs} <= drawn
+        assert {(f"neural/{encoding}/{other}", name) for encoding, name in pairs} <= refused
     for renderer in ("volsdf", "neus"):
-        assert {(f"neural/{encoding}/sdf", f"{renderer}/{sampler}") for encoding in ENCODINGS for sampler in SAMPLERS} <= drawn
-        assert {("neural", renderer), ("gaussians", renderer), ("neural/hash/density", f"{renderer}/occupancy")} <= refused
+        assert {("neural", renderer), ("gaussians", renderer)} <= refused
     assert {(f"neural/{encoding}/sdf", "sphere_tracing") for encoding in ENCODINGS} <= drawn
     assert {("neural", "sphere_tracing"), ("gaussians", "sphere_tracing"), ("neural/hash/density", "sphere_tracing")} <= refused
 

@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple
 import pytest
 import torch
 from PIL import Image
+from shared_folders import Once
 from torch import Tensor
 
 from invgraphics.core import Scene
@@ -190,6 +191,22 @@ def write_blender(scene: Scene, folder: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The toy scene on disk."""
-    return write_blender(toy_scene(), tmp_path_factory.mktemp("toy"))
+def toy_folder(once: Once) -> Path:
+    """The toy scene on disk, the same folder for all test processes; to be read only."""
+    return once("toy", lambda folder: write_blender(toy_scene(), folder))
+
+
+TOY_STEPS = {"volumetric/hash": 400, "splatting/gaussians": 200}
+
+
+@pytest.fixture(scope="session")
+def toy_runs(toy_folder: Path, once: Once) -> dict[str, Path]:
+    """Fits of the toy scene: method -> run folder, to be read only."""
+
+    def fit(folder: Path) -> None:
+        for method, steps in TOY_STEPS.items():
+            out, budget = str(folder / method.replace("/", "-")), f"{steps}steps"
+            fit_run(FitRequest(method=method, scene=str(toy_folder), out=out, budget=budget, overrides=tuple(SMALL[method])))
+
+    folder = once("toy-runs", fit)
+    return {method: folder / method.replace("/", "-") for method in TOY_STEPS}

@@ -1,4 +1,4 @@
-"""How long the waiting threads of torch's pool may spin; set before torch is imported."""
+"""Cores that thread pools may use, and how long their waiting threads may spin, which is set before torch is imported."""
 
 import os
 import sys
@@ -9,3 +9,8 @@ SPIN_SETTING_IS_LATE = "torch" in sys.modules and not {"GOMP_SPINCOUNT", "OMP_WA
 # torch and Numba bring a thread pool each. A thread that waits by spinning takes the core that the other pool's thread needs;
 # with one more busy process on two cores, steps then took ten times as long. Read by libgomp when torch is imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+
+
+def usable_cores() -> int:
+    """Cores that this process may use: fewer than the machine has where it is pinned to some."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

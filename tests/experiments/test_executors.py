@@ -18,10 +18,11 @@ from training_fixtures import SMALL
 from invgraphics import plugins
 from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import Outcome, Resources
-from invgraphics.experiments.executors.local import LocalExecutor, cores
+from invgraphics.experiments.executors.local import LocalExecutor
 from invgraphics.experiments.request import FitRequest
 from invgraphics.interruption import Terminated
 from invgraphics.runs.folder import CHECKPOINT, RunFolder
+from invgraphics.thread_pools import usable_cores
 
 METHOD = "splatting/gaussians"
 ENDLESS = {"budget": "1000000steps", "checkpoint_every": "10000s"}
@@ -80,7 +81,7 @@ def test_at_most_so_many_run_at_a_time(request_for, tmp_path: Path, monkeypatch)
     program.write_text(f"#!/bin/sh\necho begin >> {log}\nsleep 0.2\necho end >> {log}\n")
     program.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(program))
-    monkeypatch.setattr("invgraphics.experiments.executors.local.cores", lambda: 2)
+    monkeypatch.setattr("invgraphics.experiments.executors.local.usable_cores", lambda: 2)
     requests = [request_for(str(i)) for i in range(5)]
     for jobs in (1, 2):
         log.unlink(missing_ok=True)
@@ -94,8 +95,8 @@ def test_at_most_so_many_run_at_a_time(request_for, tmp_path: Path, monkeypatch)
 
 
 def test_more_jobs_than_cores_are_refused() -> None:
-    with pytest.raises(InputError, match=f"has {cores()} cores"):
-        LocalExecutor(Resources(jobs=cores() + 1))
+    with pytest.raises(InputError, match=f"has {usable_cores()} cores"):
+        LocalExecutor(Resources(jobs=usable_cores() + 1))
 
 
 @pytest.fixture

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from invgraphics.experiments.executors.local import cores
+from invgraphics.thread_pools import usable_cores
 
 
 @pytest.fixture(autouse=True)
 def _all_cores() -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(cores())
+    torch.set_num_threads(usable_cores())
     yield
     torch.set_num_threads(before)

@@ -7,12 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from training_fixtures import SMALL
 
 from invgraphics.experiments import evaluate as evaluation
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.request import FitRequest
-from invgraphics.experiments.run import fit_run
 from invgraphics.report.data.ray import read_ray
 from invgraphics.runs.folder import RunFolder
 from invgraphics.tools import explain as explaining
@@ -20,20 +17,7 @@ from invgraphics.tools import film as filming
 from invgraphics.tools.colorize import colorize
 
 METHODS = ("volumetric/hash", "splatting/gaussians")
-STEPS = {"volumetric/hash": 400, "splatting/gaussians": 60}
 SCALE = 3.0
-
-
-@pytest.fixture(scope="module")
-def runs(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    root, found = tmp_path_factory.mktemp("units"), {}
-    for method in METHODS:
-        out = str(root / method.replace("/", "-"))
-        request = FitRequest(
-            method=method, scene=str(toy_folder), out=out, budget=f"{STEPS[method]}steps", overrides=tuple(SMALL[method])
-        )
-        found[method] = fit_run(request)
-    return found
 
 
 def _enlarged(run: Path, scene: str | None = None) -> Fitted:
@@ -48,8 +32,8 @@ def _range(legend: str) -> list[float]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_depth_is_in_world_units(runs: dict[str, Path], method: str, tmp_path: Path, monkeypatch, capsys) -> None:
-    run = runs[method]
+def test_every_depth_is_in_world_units(toy_runs: dict[str, Path], method: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    run = toy_runs[method]
     fitted = _enlarged(run)
     camera = fitted.scene.test[0].camera
     rendering = fitted.model.render(camera, normals=False)
@@ -89,8 +73,8 @@ def test_every_depth_is_in_world_units(runs: dict[str, Path], method: str, tmp_p
     assert _range(told) == pytest.approx(expected, rel=0.05) and "world units" in told
 
 
-def test_older_explanations_say_local(runs: dict[str, Path], tmp_path: Path) -> None:
-    explaining.explain(explaining.ExplainRequest(runs["volumetric/hash"], 0, (9, 9), out=tmp_path))
+def test_older_explanations_say_local(toy_runs: dict[str, Path], tmp_path: Path) -> None:
+    explaining.explain(explaining.ExplainRequest(toy_runs["volumetric/hash"], 0, (9, 9), out=tmp_path))
     facts = json.loads((tmp_path / "ray.json").read_text())
     del facts["length_unit"]
     (tmp_path / "ray.json").write_text(json.dumps(facts))

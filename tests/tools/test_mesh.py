@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
-from training_fixtures import SMALL
+from training_fixtures import SMALL, TOY_STEPS
 
 import invgraphics as ig
 from invgraphics.cli import main
@@ -197,22 +198,8 @@ def test_lattice_covers_the_box_with_cubes() -> None:
     assert (centres.amin(dim=0).tolist(), centres.amax(dim=0).tolist()) == ([0.125] * 3, [1.875, 0.875, 0.375])
 
 
-@pytest.fixture(scope="module")
-def runs(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    root = tmp_path_factory.mktemp("meshes")
-    steps = {"volumetric/hash": "300steps", "splatting/gaussians": "200steps"}
-    return {
-        method: fit_run(
-            FitRequest(
-                method=method, scene=str(toy_folder), out=str(root / method[:5]), budget=budget, overrides=(*SMALL[method],)
-            )
-        )
-        for method, budget in steps.items()
-    }
-
-
 @pytest.mark.parametrize("method", ["volumetric/hash", "splatting/gaussians"])
-def test_a_run_becomes_a_file(runs: dict[str, Path], tmp_path: Path, capsys, monkeypatch, method: str) -> None:
+def test_a_run_becomes_a_file(toy_runs: dict[str, Path], tmp_path: Path, capsys, monkeypatch, method: str) -> None:
     """In the world's coordinates, readable by plyfile; the toy's balls are where they are."""
     similarity = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))
     similarity[:3, 3] = torch.tensor([10.0, 0.0, 0.0])
@@ -220,7 +207,10 @@ def test_a_run_becomes_a_file(runs: dict[str, Path], tmp_path: Path, capsys, mon
     monkeypatch.setattr(opened, "open_scene", lambda *words: replace(opener(*words), world_from_local=similarity))
     out = tmp_path / "model.ply"
     level = ["--level", "1"] if method == "volumetric/hash" else []
-    assert main.run(["export", str(runs[method]), "--to", "mesh", "--out", str(out), "--resolution", "32", *level]) == main.DONE
+    assert (
+        main.run(["export", str(toy_runs[method]), "--to", "mesh", "--out", str(out), "--resolution", "32", *level])
+        == main.DONE
+    )
     said = capsys.readouterr().out
     assert ("density 1 per local unit" if level else "median depth of 12 training views") in said
     file = PlyData.read(out)
@@ -237,25 +227,26 @@ def test_a_run_becomes_a_file(runs: dict[str, Path], tmp_path: Path, capsys, mon
     assert vertex["red"].std() > (1 if level else 10)
 
 
-def test_bad_requests_get_a_sentence(runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_requests_get_a_sentence(toy_runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main.run(["export", "--help"])
     helped = " ".join(capsys.readouterr().out.split())
     assert all(f"(default: {default})" in helped for default in (RESOLUTION, PLANES))
     with pytest.raises(InputError, match="--resolution"):
-        ExportRequest(runs["volumetric/hash"], "mesh", tmp_path / "a.ply", resolution=2)
+        ExportRequest(toy_runs["volumetric/hash"], "mesh", tmp_path / "a.ply", resolution=2)
     with pytest.raises(InputError, match="no density with a level"):
-        export_run(ExportRequest(runs["splatting/gaussians"], "mesh", tmp_path / "a.ply", level=3.0))
+        export_run(ExportRequest(toy_runs["splatting/gaussians"], "mesh", tmp_path / "a.ply", level=3.0))
     with pytest.raises(InputError, match=r"no level.*\nChoose another --level"):
-        export_run(ExportRequest(runs["volumetric/hash"], "mesh", tmp_path / "a.ply", level=1e9, resolution=16))
+        export_run(ExportRequest(toy_runs["volumetric/hash"], "mesh", tmp_path / "a.ply", level=1e9, resolution=16))
     assert not list(tmp_path.iterdir())
 
 
-def test_a_fitted_density_is_seen_as_a_mesh(runs: dict[str, Path], toy_folder: Path) -> None:
+def test_a_fitted_density_is_seen_as_a_mesh(toy_runs: dict[str, Path], toy_folder: Path, tmp_path: Path) -> None:
     """Through the surface renderer, as a rendering beside the run, and with colours refitted, from the run and from a file."""
-    source = runs["volumetric/hash"]
+    source = Path(shutil.copytree(toy_runs["volumetric/hash"], tmp_path / "hash"))
     shared = {"scene": str(toy_folder), "existing": "reuse"}
-    again = {"method": "volumetric/hash", "budget": "300steps", "overrides": (*SMALL["volumetric/hash"],), "out": str(source)}
+    steps, small = TOY_STEPS["volumetric/hash"], (*SMALL["volumetric/hash"],)
+    again = {"method": "volumetric/hash", "budget": f"{steps}steps", "overrides": small, "out": str(source)}
     variant = "surface/mesh:resolution=32:level=1.0"
     fit_run(FitRequest(**shared, **again, render_with=(variant,)))
     (folder,) = (source / "rendered").iterdir()
@@ -269,22 +260,22 @@ def test_a_fitted_density_is_seen_as_a_mesh(runs: dict[str, Path], toy_folder: P
     assert 15 < shown.quality["psnr"].mean < native  # a level of 1 makes the fog thick
     assert shown.quality["alpha_iou"].mean > 0.7
 
-    out = source.parent / "refitted"
+    out = tmp_path / "refitted"
     common = {**shared, "method": "surface/mesh", "budget": "60steps"}
     settings = (f"field.source={source}", "field.resolution=32", "field.level=1.0", "field.sh_degree=1")
     fit_run(FitRequest(**common, out=str(out), overrides=settings))
     refitted = ig.load_run(out)
     assert refitted.scores["psnr"] > shown.quality["psnr"].mean
-    exported = export_run(ExportRequest(out, "mesh", source.parent / "refitted.glb"))
+    exported = export_run(ExportRequest(out, "mesh", tmp_path / "refitted.glb"))
     assert exported.facts["surface"] == "the mesh of the field"
     with pytest.raises(InputError, match=r"is a mesh already\.\nLeave --resolution out"):
-        export_run(ExportRequest(out, "mesh", source.parent / "a.glb", resolution=64))
+        export_run(ExportRequest(out, "mesh", tmp_path / "a.glb", resolution=64))
     back = mesh_from_file(exported.path, run.scene)
     field = refitted.model.field
     torch.testing.assert_close(back.vertices, field.vertices, atol=1e-5, rtol=0)
     # glTF is y-up: the file's second axis is the world's third.
     torch.testing.assert_close(read_mesh(exported.path).vertices[:, 1], field.vertices[:, 2], atol=1e-5, rtol=0)
-    third = source.parent / "from-file"
+    third = tmp_path / "from-file"
     fit_run(FitRequest(**common, out=str(third), overrides=(f"field.source={exported.path}", "field.sh_degree=1")))
     assert ig.load_run(third).scores["psnr"] == pytest.approx(refitted.scores["psnr"], abs=0.3)
 

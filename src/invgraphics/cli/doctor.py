@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from invgraphics.cli.output import show_table
+from invgraphics.thread_pools import usable_cores
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,6 @@ def _processor() -> Iterator[Finding]:
     import torch
 
     from invgraphics.experiments.environment import cpu_name
-    from invgraphics.experiments.executors.local import cores as usable_cores
 
     cores, threads = os.cpu_count() or 1, torch.get_num_threads()
     allowed = usable_cores()

@@ -24,7 +24,6 @@ from invgraphics.experiments.build import (
 from invgraphics.experiments.clocks import at_step, disturbance, fit_costs, fit_record, load_average
 from invgraphics.experiments.environment import code_version, continued, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
-from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import check_existing, other_run, run_digest, truth_digest
 from invgraphics.experiments.job import Job, make_training_scene, region_of
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
@@ -48,6 +47,7 @@ from invgraphics.runs.schema import write_json
 from invgraphics.scenes.open import selection_notes, space_note
 from invgraphics.tables import read_json
 from invgraphics.text import duration
+from invgraphics.thread_pools import usable_cores
 from invgraphics.training.fit import Fit, Plan
 
 
@@ -129,7 +129,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
             title = f"{method.name} seed {request.seed}"
             Recorder(fit, folder, job.cadence, title, request.snapshots, on_step, memory).run()
         load = LoadAverage(start=began_at, end=load_average())
-        spent = replace(fit_record(fit.steps, fit.clocks(), memory.peak_bytes), cores=cores(), load_average=load)
+        spent = replace(fit_record(fit.steps, fit.clocks(), memory.peak_bytes), cores=usable_cores(), load_average=load)
         _declare_clocks(folder, spent)
         _evaluate(job, scene, fit, spent)
         render_missing(job, scene)

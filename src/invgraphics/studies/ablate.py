@@ -17,7 +17,6 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.executors.base import Executor, Outcome, Resources
-from invgraphics.experiments.executors.local import cores
 from invgraphics.experiments.identity import run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import Reporter
@@ -35,6 +34,7 @@ from invgraphics.studies.reading import locate, name_of, read_study, with_reques
 from invgraphics.studies.record import CellState, StudyRecorder, summarise_study
 from invgraphics.studies.study import Study
 from invgraphics.text import duration
+from invgraphics.thread_pools import usable_cores
 
 Size = int | tuple[int, int] | None
 """Longest side in pixels, or (width, height)."""
@@ -81,7 +81,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
     path = locate(request.study)
     study = with_request(read_study(path), request)
     # Pinned also where a run has the machine to itself, so that its bits do not depend on who starts it.
-    threads = torch.get_num_threads() if request.jobs == 1 else max(1, cores() // request.jobs)
+    threads = torch.get_num_threads() if request.jobs == 1 else max(1, usable_cores() // request.jobs)
     resources = Resources(jobs=request.jobs, threads=threads, gpus=request.gpus, address=request.address, logs=True)
     executor: Executor = plugins.load("executors", request.executor)(resources)
     plan = make_plan(study, request)

@@ -19,16 +19,12 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.interruption import INTERRUPTED, WITH_PARENT, Terminated
 from invgraphics.runs.schema import write_json
 from invgraphics.tables import read_json
+from invgraphics.thread_pools import usable_cores
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables from which libraries take their number of threads."""
 INTERRUPT_SECONDS = 30.0
 """Seconds in which an interrupted fit ends its step, or what is being compiled, before it is terminated."""
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class FitProcess:
@@ -100,8 +96,8 @@ class LocalExecutor:
 
     def __init__(self, resources: Resources | None = None) -> None:
         self._resources = resources or Resources()
-        if not 1 <= self._resources.jobs <= cores():
-            raise InputError(f"--jobs cannot be {self._resources.jobs}: this machine has {cores()} cores.")
+        if not 1 <= self._resources.jobs <= usable_cores():
+            raise InputError(f"--jobs cannot be {self._resources.jobs}: this machine has {usable_cores()} cores.")
 
     def run(self, requests: Sequence[FitRequest], jobs: Path) -> Generator[Outcome, None, None]:
         """See `Executor.run`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ from invgraphics.scenes.mitsuba.folder import view_paths
 from invgraphics.scenes.mitsuba.job import Job
 from invgraphics.scenes.mitsuba.rig import SPLITS, Split
 from invgraphics.scenes.process import Progress
+from invgraphics.thread_pools import usable_cores
 
 SETTLED_SECONDS = 5.0
 """A first view that takes less is mostly compilation: then the second one is timed."""
@@ -63,7 +63,7 @@ class RenderingForecast:
             return
         self._reported = True
         left = seconds * sum(self._left.values()) / samples
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = usable_cores()
         width, height = self._job.size
         length = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min" if left < 6000 else f"{left / 3600:.1f} h"
         self._say(
