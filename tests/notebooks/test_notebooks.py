@@ -267,8 +267,8 @@ def _ewa(out: _Printed) -> None:
         0.0,
         *itertools.accumulate((2 * band + 1) * integral**2 / 4 for band, integral in ((1, 1 / 3), (2, 1 / 8), (3, 0.0))),
     ]
-    matte = out.numbers("highlight of exponent 1: degree 0 leaves", ", 1", ", 2", ", 3")
-    assert matte == pytest.approx([math.sqrt(1 - part / (1 / 6 - 1 / 4**2)) for part in held], abs=0.01)
+    broad = out.numbers("highlight of exponent 1: degree 0 leaves", ", 1", ", 2", ", 3")
+    assert broad == pytest.approx([math.sqrt(1 - part / (1 / 6 - 1 / 4**2)) for part in held], abs=0.01)
     assert out.numbers("highlight of exponent 100: degree 0 leaves", ", 1", ", 2", ", 3")[3] > 0.8
 
 
