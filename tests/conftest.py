@@ -59,6 +59,7 @@ def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plots are laid out but not painted, which takes half of the time of a page, for tests of everything but plots."""
     from matplotlib.figure import Figure
 
+    monkeypatch.setattr("invgraphics.report.figures.views.EVENLY_SPACED", 1)  # how many views a page shows
     monkeypatch.setattr(Figure, "draw_without_rendering", lambda figure: None)
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **settings: file.write("<svg/>"))
 

@@ -24,6 +24,8 @@ PRELOADED = [
         "scipy.ndimage",
         "tomlkit",
     ),
+    *("tyro", "rich.table", "rich.progress", "jinja2", "skimage.metrics"),
+    *("invgraphics.cli.main", "invgraphics.cli.fit", "invgraphics.cli.report", "invgraphics.experiments.run"),
 ]
 
 _context = multiprocessing.get_context("forkserver")

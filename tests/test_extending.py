@@ -33,11 +33,11 @@ def _blocks(language: str) -> str:
     return "\n".join(re.findall(rf"^```{language}\n(.*?)^```", PAGE, flags=re.S | re.M))
 
 
-@pytest.fixture
-def environment(tmp_path: Path) -> dict[str, str]:
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """A process environment in which the page's package is installed."""
-    info = tmp_path / "site" / "voxel_world-1.0.dist-info"
-    info.mkdir(parents=True)
+    info = tmp_path_factory.mktemp("site") / "voxel_world-1.0.dist-info"
+    info.mkdir()
     (info.parent / "voxel_world.py").write_text(_blocks("python"))
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: voxel-world\nVersion: 1.0\n")
     groups = tomllib.loads(_blocks("toml"))["project"]["entry-points"]
@@ -47,11 +47,10 @@ def environment(tmp_path: Path) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "200"}
 
 
-@pytest.fixture
-def turntable(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def turntable(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sixteen turns of two balls, seen from a little above."""
-    folder = tmp_path / "turntable"
-    folder.mkdir()
+    folder = tmp_path_factory.mktemp("turntable")
     scene, size = toy_scene(views=2, size=8), 20
     renderer, field = VolumetricConfig(StratifiedConfig(count=96)).build(scene), TwoBalls()
     for index in range(16):
@@ -66,10 +65,56 @@ def turntable(tmp_path: Path) -> Path:
     return folder
 
 
-def _run(environment: dict[str, str], *arguments: str) -> str:
-    done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False)
+LOSS = """
+import torch, invgraphics as ig
+from invgraphics.core import Batch, Bounds, Context, Rendering, Trace
+from voxel_world import EmptyLoss
+alpha = torch.tensor([0.5, 0.5, 0.25, 1.0])
+batch = Batch(torch.ones(4, 3), torch.tensor([0.0, 0.5, 1.0, 1.0]), torch.ones(3))
+bounds = Bounds(-torch.ones(3), torch.ones(3))
+rendering = Rendering(torch.ones(4, 3), alpha, alpha)
+for progress in (0.0, 0.5):
+    print(float(EmptyLoss(weight=2)(rendering, Trace(), batch, Context(bounds, progress=progress))))
+scene = ig.load_scene(TURNTABLE)
+small = {'field.resolution': 8, 'batches.rays': 64}
+names = ('volumetric/voxels', 'volumetric/voxels-empty')
+plain, empty = (ig.fit(ig.load_method(name, set=small), scene, '60steps') for name in names)
+print(plain.scores['halo'], empty.scores['halo'])
+"""
+PENALTY_AND_HOOK = """
+from torch.nn.functional import softplus
+penalty, hook = (ig.load_method('volumetric/voxels-smooth', set=small | {part: []}) for part in ('hooks', 'penalties'))
+for fit in (plain, ig.fit(penalty, scene, '60steps'), ig.fit(hook, scene, '60steps')):
+    grid = fit.model.field.grid.detach()
+    rough = sum(float(grid.diff(dim=axis).square().mean()) for axis in (1, 2, 3))
+    density = softplus(grid[3])
+    print(rough, int(((density > 1e-3) & (density < 0.05)).sum()))
+"""
+SCENE = """
+import numpy as np
+from invgraphics.testing import toy_scene
+from voxel_world import scene_of
+views = toy_scene(views=9, size=12).train
+pictures = np.stack([view.image.numpy() for view in views])
+poses = np.stack([view.camera.cam_to_world.double().numpy() for view in views])
+scene = scene_of(pictures, poses, float(views[0].camera.focal[0]))
+print(len(scene.train), len(scene.test), ig.fit('splatting/gaussians', scene, '5steps').scores['psnr'])
+"""
+
+
+def _run(environment: dict[str, str], code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+@pytest.fixture(scope="module")
+def printed(environment: dict[str, str], turntable: Path) -> dict[str, list[float]]:
+    """What each of the codes above prints, one after the other in one process, which takes seconds to start."""
+    parts = {"loss": LOSS, "penalty and hook": PENALTY_AND_HOOK, "scene": SCENE}
+    code = "print(chr(12))".join(f"\n{part.replace('TURNTABLE', repr(str(turntable)))}\n" for part in parts.values())
+    said = _run(environment, code).split("\f")
+    return {name: [float(word) for word in text.split()] for name, text in zip(parts, said, strict=True)}
 
 
 def test_signatures_on_the_page_are_those_of_the_contract() -> None:
@@ -117,7 +162,7 @@ def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable:
         "print(len(scene.train), len(scene.test), report.failures, *[report.scores(name)['psnr'] for name in report.methods])\n"
         "print((report.run(report.methods[0]).through('brightest/voxels')).render(scene.test[0].camera).rgb.shape)\n"
     )
-    *listed, numbers, shape = _run(environment, "-c", code).splitlines()
+    *listed, numbers, shape = _run(environment, code).splitlines()
     for name in ("voxel_world:VoxelsConfig", "voxel_world:BrightestConfig", "voxel_world:MidpointsConfig", "brightest/voxels"):
         assert any(name in line for line in listed), name
     train, test, failures, *psnr = numbers.split()
@@ -126,54 +171,18 @@ def test_the_parts_conform_and_take_part(environment: dict[str, str], turntable:
     assert "Dense voxel grid" in (tmp_path / "report" / "index.html").read_text()
 
 
-def test_the_loss_clears_what_the_metric_sees(environment: dict[str, str], turntable: Path) -> None:
-    code = (
-        "import torch, invgraphics as ig\n"
-        "from invgraphics.core import Batch, Bounds, Context, Rendering, Trace\n"
-        "from voxel_world import EmptyLoss\n"
-        "alpha = torch.tensor([0.5, 0.5, 0.25, 1.0])\n"
-        "batch = Batch(torch.ones(4, 3), torch.tensor([0.0, 0.5, 1.0, 1.0]), torch.ones(3))\n"
-        "bounds = Bounds(-torch.ones(3), torch.ones(3))\n"
-        "rendering = Rendering(torch.ones(4, 3), alpha, alpha)\n"
-        "for progress in (0.0, 0.5):\n"
-        "    print(float(EmptyLoss(weight=2)(rendering, Trace(), batch, Context(bounds, progress=progress))))\n"
-        f"scene = ig.load_scene({str(turntable)!r})\n"
-        "for name in ('volumetric/voxels', 'volumetric/voxels-empty'):\n"
-        "    method = ig.load_method(name, set={'field.resolution': 8, 'batches.rays': 64})\n"
-        "    print(ig.fit(method, scene, '60steps').scores['halo'])\n"
-    )
-    early, late, without, cleared = map(float, _run(environment, "-c", code).split())
+def test_the_loss_clears_what_the_metric_sees(printed: dict[str, list[float]]) -> None:
+    early, late, without, cleared = printed["loss"]
     assert (early, late) == (0.0, 2 * (0.5 + 0.25) / 4)
     assert 0 < cleared < 0.8 * without, (without, cleared)
 
 
-def test_the_penalty_smooths_and_the_hook_clears(environment: dict[str, str], turntable: Path) -> None:
-    code = (
-        "import torch, invgraphics as ig\n"
-        "from torch.nn.functional import softplus\n"
-        f"scene = ig.load_scene({str(turntable)!r})\n"
-        "for name in ('volumetric/voxels', 'volumetric/voxels-smooth'):\n"
-        "    method = ig.load_method(name, set={'field.resolution': 8, 'batches.rays': 64})\n"
-        "    grid = ig.fit(method, scene, '60steps').model.field.grid.detach()\n"
-        "    rough = sum(float(grid.diff(dim=axis).square().mean()) for axis in (1, 2, 3))\n"
-        "    density = softplus(grid[3])\n"
-        "    print(rough, int(((density > 1e-3) & (density < 0.05)).sum()))\n"
-    )
-    rough, hazy, smooth, clear = map(float, _run(environment, "-c", code).split())
-    assert clear == 0 < hazy
-    assert smooth < 2 * rough, "emptied corners are steps"
+def test_the_penalty_smooths_and_the_hook_clears(printed: dict[str, list[float]]) -> None:
+    rough, hazy, smooth, _, _, clear = printed["penalty and hook"]
+    assert smooth < 0.9 * rough, "by the penalty alone: corners that the hook has emptied are steps"
+    assert clear == 0 < hazy, "by the hook alone"
 
 
-def test_a_scene_made_in_python(environment: dict[str, str]) -> None:
-    code = (
-        "import numpy as np, torch, invgraphics as ig\n"
-        "from invgraphics.testing import toy_scene\n"
-        "from voxel_world import scene_of\n"
-        "views = toy_scene(views=9, size=12).train\n"
-        "pictures = np.stack([view.image.numpy() for view in views])\n"
-        "poses = np.stack([view.camera.cam_to_world.double().numpy() for view in views])\n"
-        "scene = scene_of(pictures, poses, float(views[0].camera.focal[0]))\n"
-        "print(len(scene.train), len(scene.test), ig.fit('splatting/gaussians', scene, '5steps').scores['psnr'])\n"
-    )
-    train, test, psnr = _run(environment, "-c", code).split()
-    assert (train, test) == ("7", "2") and float(psnr) > 5
+def test_a_scene_made_in_python(printed: dict[str, list[float]]) -> None:
+    train, test, psnr = printed["scene"]
+    assert (train, test) == (7, 2) and psnr > 5

@@ -63,6 +63,7 @@ def test_the_examples_hold(thing: object, request: pytest.FixtureRequest) -> Non
     """Fits of comparison and study are made in this process."""
     if thing in (ig.ablate, ig.compare):
         request.getfixturevalue("in_process")
+        request.getfixturevalue("unpainted")
     (test,) = doctest.DocTestFinder(recurse=False).find(thing, name=thing.__name__)
     assert test.examples
     said = io.StringIO()
@@ -70,7 +71,7 @@ def test_the_examples_hold(thing: object, request: pytest.FixtureRequest) -> Non
     assert not failed, said.getvalue()
 
 
-def test_the_readme_holds(in_process) -> None:
+def test_the_readme_holds(in_process, unpainted) -> None:
     """Its blocks of Python, one after the other, on the toy and with few steps."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.S | re.M)
     assert len(blocks) == 3
@@ -115,6 +116,10 @@ def test_fits_in_memory_and_in_a_folder_are_the_same_fit() -> None:
     assert in_memory.scores.record.cost["steps"] == 20
     command = json.loads(Path("run/provenance.json").read_text())["command"]
     assert f"fit {SPLATS.name} run/scene.npz" in command
+    # The folder takes its scene along.
+    Path("run").rename("moved")
+    assert ig.load_run("moved").evaluate()["psnr"] == kept.scores["psnr"]
+    assert ig.fit(SPLATS, kept.scene, budget="20steps", out="moved").scores["psnr"] == kept.scores["psnr"]
 
 
 def test_a_stopped_fit_goes_on_to_the_same_bits(capsys: pytest.CaptureFixture[str]) -> None:
@@ -212,13 +217,13 @@ def test_methods_come_in_every_shape(out: str | None) -> None:
         ig.load_method("volumetric/nerf", set={"field.widht": 32})
 
 
-def test_a_comparison_of_a_scene_made_in_python() -> None:
-    """Its fits have a process each, as for a user."""
+def test_a_comparison_of_a_scene_made_in_python(in_process) -> None:
     scene = toy_scene(views=8, size=24)
     lost = ig.load_method("splatting/gaussians", set={"field.init": "field", "field.source": "nowhere"})
     with pytest.raises(InputError, match="nowhere is not a run"):  # before any fit
         ig.compare(scene, [SPLATS, lost], budget="2steps", out="report")
     broken = ig.load_method("splatting/gaussians", set={"optimiser.groups.colour.lr": 1e38})
+    in_process.fails = staticmethod(lambda request: "Step 1: not finite." if request.method == broken.name else "")
     report = ig.compare(scene, [SPLATS, broken], budget="2steps", seeds=(3,), out="report")
     assert report.methods == (SPLATS.name, broken.name)
     assert [(failure.method, failure.seed) for failure in report.failures] == [(broken.name, 3)]
@@ -362,7 +367,7 @@ def test_training_data_can_be_changed_from_python_in_memory_and_in_a_folder() ->
 
 
 def test_the_points_of_a_comparison_are_chosen_from_python(
-    in_process, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    in_process, unpainted, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of a rendered scene they are ``sfm`` unless the caller says otherwise; the hint names what ``data`` takes."""
     scene = ig.load_scene("toy.npz")
@@ -382,7 +387,7 @@ def test_the_points_of_a_comparison_are_chosen_from_python(
     assert black.record.scene_info.background == untold.record.scene_info.background
 
 
-def test_a_lone_method_renderer_or_seed_needs_no_list(in_process) -> None:
+def test_a_lone_method_renderer_or_seed_needs_no_list(in_process, unpainted) -> None:
     report = ig.compare("toy.npz", SPLATS.name, "2steps", seeds=2, out="lone", render_with="gaussian-volume/exact:steps=4")
     assert report.methods == (SPLATS.name,) and report.run(SPLATS.name, 2).finished
     assert "--seeds 2 " in report.record.command and "--render-with gaussian-volume/exact:steps=4 " in report.record.command

@@ -113,3 +113,9 @@ def test_another_copy_of_a_run_s_scene_is_the_same_scene(tmp_path: Path) -> None
     other = ig.save_scene(toy_scene(views=6, size=12), tmp_path / "other.npz")
     with pytest.raises(InputError, match="are not those that kept-with-its-scene was fitted beside"):
         ig.load_run("kept-with-its-scene", scene=str(other))
+    # Nor is a run shown on what has taken its scene's place.
+    mine = ig.save_scene(toy_scene(views=8, size=14), tmp_path / "mine.npz")
+    ig.fit(ONE, str(mine), "1steps", out="fitted")
+    other.replace(mine)
+    with pytest.raises(InputError, match="are not those that fitted was fitted beside"):
+        ig.load_run("fitted")

@@ -28,7 +28,7 @@ from invgraphics.runs.history import read_history
 
 METHOD = "splatting/gaussians"
 SIZE = 16 << 20
-ROOMS = (0, 1 << 14, 1 << 16, 1 << 18, 1 << 20, 1 << 22, 1 << 23)
+ROOMS = (0, 1 << 14, 1 << 16, 1 << 19, 1 << 23)
 """Free bytes with which a command is tried, until it ends well."""
 Words = Callable[[Path, Path], list[str]]
 

@@ -162,11 +162,14 @@ UNBOUNDED = re.compile(
 """Readers without limits on size, depth and digits, or that execute what they read."""
 
 
-@pytest.mark.parametrize("path", sorted(SOURCES.rglob("*.py")), ids=lambda path: path.relative_to(SOURCES).as_posix())
-def test_no_other_module_parses_json_toml_or_arrays(path: Path) -> None:
-    if path in (Path(tables.__file__), Path(arrays.__file__)):
-        return
-    nodes = list(ast.walk(ast.parse(path.read_text())))
-    uses = {ast.unparse(node) for node in nodes if isinstance(node, ast.Attribute)}
-    uses |= {f"{node.module}.{name.name}" for node in nodes if isinstance(node, ast.ImportFrom) for name in node.names}
-    assert not [use for use in uses if UNBOUNDED.fullmatch(use)]
+def test_no_other_module_parses_json_toml_or_arrays() -> None:
+    paths = sorted({*SOURCES.rglob("*.py")} - {Path(tables.__file__), Path(arrays.__file__)})
+    assert len(paths) > 500
+    found = []
+    for path in paths:
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        attributes = [node for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
+        uses = {ast.unparse(node) for node in attributes}
+        uses |= {f"{node.module}.{name.name}" for node in nodes if isinstance(node, ast.ImportFrom) for name in node.names}
+        found += [f"{path.relative_to(SOURCES)}: {use}" for use in uses if UNBOUNDED.fullmatch(use)]
+    assert not found

@@ -12,6 +12,7 @@ import math
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from invgraphics import plugins
@@ -41,7 +42,7 @@ def fill(schema: type[T], table: Mapping[str, Any], path: str = "") -> T:
     Raises:
         InputError: a key is unknown, missing or of the wrong type; the sentence names its dotted path.
     """
-    hints = get_type_hints(schema, include_extras=True)
+    hints = _hints(schema)
     fields = {field.name: field for field in dataclasses.fields(schema) if field.init}  # type: ignore[arg-type]
     for key in table:
         if key not in fields:
@@ -58,6 +59,12 @@ def fill(schema: type[T], table: Mapping[str, Any], path: str = "") -> T:
         raise InputError(f"'{path or schema.__name__}': {error}") from error
 
 
+@cache
+def _hints(schema: type) -> dict[str, Any]:
+    """Types of a dataclass's fields, whose annotations are evaluated once."""
+    return get_type_hints(schema, include_extras=True)
+
+
 def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
     """Fill the registered config that ``table['type']`` names from the rest of the table."""
     if not isinstance(table, Mapping) or "type" not in table:
@@ -71,7 +78,7 @@ def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
 
 def to_table(config: Any) -> dict[str, Any]:
     """Convert a config to its complete table (inverse of `fill`), with defaults, without ``None`` (see `OMIT_EMPTY`)."""
-    hints = get_type_hints(type(config), include_extras=True)
+    hints = _hints(type(config))
     table = {}
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)

@@ -145,7 +145,7 @@ def read_text(path: Path, most: int) -> str:
     try:
         with path.open("rb") as file:
             data = file.read(most + 1)
-        text = data.decode("utf-8")
+        text = data.decode("utf-8-sig")  # with or without a byte-order mark
     except FileNotFoundError:
         raise InputError(f"{path} does not exist.") from None
     except UnicodeDecodeError as error:

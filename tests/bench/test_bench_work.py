@@ -1,13 +1,17 @@
 """What is measured: the synthetic object, counts of work, the limits' kernels, and a run from end to end at tiny sizes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import KDTree
 
 from invgraphics import kernels
+from invgraphics.bench import gates as gates_module
 from invgraphics.bench import (
     iterations,
+    lattice_cases,
     limits,
     memory,
     peers,
@@ -232,5 +236,9 @@ def test_quick_runs_measure_what_promises_on_lattices_are_made_for(monkeypatch) 
     monkeypatch.setattr("invgraphics.bench.run._budget", lambda request: TimingBudget(0.0, 1, 1))
     monkeypatch.setattr("invgraphics.bench.run._measure_limits", lambda request, results: None)
     monkeypatch.setattr("invgraphics.bench.run.kernels.warm_up", lambda: None)
+    for name, layout in lattice_cases.LAYOUTS.items():
+        monkeypatch.setitem(lattice_cases.LAYOUTS, name, replace(layout, vertices=16))
+    for module in (lattice_cases, peers, gates_module):
+        monkeypatch.setattr(module, "GATE_POINTS", 256)
     found = [gate for gate in gates(bench(BenchRequest(("lattice",), quick=True))) if "lattice" in gate.name]
     assert len(found) == 4 and all(gate.measured is not None for gate in found)

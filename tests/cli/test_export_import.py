@@ -39,6 +39,15 @@ def _quality(folder: Path) -> dict[str, float]:
     return {name: entry["mean"] for name, entry in json.loads((folder / "scores.json").read_text())["quality"].items()}
 
 
+def test_gaussians_that_are_shown_as_a_density_are_exported(toy_folder: Path, tmp_path: Path) -> None:
+    """Compared with the run's own pictures, which march rays through them."""
+    small = ("field.count=40", "field.max_init=40", "field.sh_degree=0", "renderer.sampler.resolution=16", "batches.rays=32")
+    request = {"method": "volumetric/gaussians", "scene": str(toy_folder), "budget": "2steps", "overrides": small}
+    run = fit_run(FitRequest(**request, out=str(tmp_path / "run")))
+    exported = export_run(ExportRequest(run, "ply", tmp_path / "model.ply"))
+    assert any("PSNR" in name for name in exported.facts), exported.facts
+
+
 @pytest.mark.parametrize(("to", "least"), [("ply", 120.0), ("splat", 50.0), ("spz", 50.0)])  # measured: 157, 57, 55
 def test_there_and_back(run: Path, toy_folder: Path, tmp_path: Path, capsys, to: str, least: float) -> None:
     file, back = tmp_path / f"model.{to}", tmp_path / "back"

@@ -14,9 +14,15 @@ from invgraphics.training.density_control import DensityControl
 from invgraphics.training.fit import Fit
 
 STEPS, LEFT = 20, 9
+OCCUPANCY = ["renderer.sampler.resolution=24", "renderer.sampler.steps_per_diagonal=96"]
+GRID = ["field.encoding.resolution=16", "field.appearance.resolution=16", *OCCUPANCY]
 CHANGES = {
-    "volumetric/dvgo": ["hooks.0.threshold=1e-6"],  # not everything is empty after four steps
-    "volumetric/plenoxels": ["hooks.0.rays=256"],
+    # Not everything is empty after four steps.
+    "volumetric/dvgo": [*GRID, "hooks.0.threshold=1e-6", "hooks.0.resolution=16", "hooks.1.resolution=24"],
+    "volumetric/plenoxels": [*GRID, "hooks.0.rays=256", "hooks.1.resolution=24"],
+    "volumetric/tensorf-vm": [*GRID, "hooks.0.resolutions=[24]"],
+    "volumetric/tensorf-cp": [*GRID, "field.encoding.components=32"],
+    "volumetric/triplane": ["field.encoding.resolution=16", "hooks.0.resolution=24", *OCCUPANCY],
     "volumetric/point-nerf": ["hooks.0.rays=64"],
 }
 WITH_HOOKS = [name for name in methods() if load_method(name, "laptop").recipe.hooks]

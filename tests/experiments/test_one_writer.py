@@ -128,9 +128,10 @@ def test_a_killed_process_holds_nothing(toy_folder: Path, tmp_path: Path) -> Non
 def test_what_a_killed_process_was_writing_is_removed(tmp_path: Path) -> None:
     """A checkpoint of gigabytes, for instance."""
     left = [tmp_path / name for name in ("checkpoint.safetensors.tmp", ".tmpAb3xYz", "test/0000.png.tmp")]
-    kept = [tmp_path / name for name in ("checkpoint.safetensors", "test/0000.png")]
+    kept = [tmp_path / name for name in ("checkpoint.safetensors", "test/0000.png", "notes.tmp", "folder.of.tmp")]
     (tmp_path / "test").mkdir()
-    for path in (*left, *kept):
+    (tmp_path / "folder.of.tmp").mkdir()
+    for path in (*left, *kept[:-1]):
         path.touch()
     with RunFolder(tmp_path).held():
         assert not any(path.exists() for path in left) and all(path.exists() for path in kept)

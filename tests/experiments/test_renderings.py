@@ -129,6 +129,12 @@ def test_what_is_there_is_kept(run: Path, request_one: FitRequest) -> None:
     assert len(_record(run)["renderings"]) == 4 and len(_record(run)["differences"]) == 6
     fit_run(request_one)
     assert len(_record(run)["renderings"]) == 3
+    # The same under one more protocol: nothing is drawn again under the one that has been.
+    before, other = _stamps(run), replace(request_one, protocol="float")
+    assert not renderings_complete(Job.of(other))
+    fit_run(other)
+    assert renderings_complete(Job.of(other)) and _stamps(run) == before
+    assert all((run / one["run"] / "scores.float.json").is_file() for one in _record(run)["renderings"])
 
 
 def test_a_changed_renderer_is_another_one_than_the_fits_own(run: Path, request_one: FitRequest, tmp_path: Path) -> None:

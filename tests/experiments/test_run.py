@@ -209,6 +209,10 @@ def test_spelling_makes_no_other_run(run: Path, toy_folder: Path) -> None:
     assert spelt.budget != request.budget
     assert run_digest(Job.of(spelt), "truth", 1) == run_digest(Job.of(request), "truth", 1)
     check_replaceable(Job.of(spelt))
+    for scene in (f"{toy_folder}/", os.path.relpath(toy_folder), f"{toy_folder}/../{toy_folder.name}"):
+        check_replaceable(Job.of(replace(request, scene=scene)))
+    with pytest.raises(InputError, match="its scene is"):
+        check_replaceable(Job.of(replace(request, scene=str(toy_folder.parent))))
 
 
 def test_a_refused_fit_leaves_no_run_behind(toy_folder: Path, tmp_path: Path) -> None:

@@ -10,9 +10,11 @@ import torch
 
 import invgraphics as ig
 from invgraphics.core import Bounds, Scene
+from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.job import Job, make_training_scene
 from invgraphics.experiments.request import FitRequest
+from invgraphics.experiments.run import fit_run
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.testing import toy_scene
@@ -74,3 +76,26 @@ def test_runs_from_before_have_the_data_sets_box(wide: Scene, tmp_path: Path) ->
     folder = RunFolder(tmp_path / "run")
     folder.write(replace(folder.read(Provenance), region=None))
     assert torch.equal(load_fitted(folder, wide).model.bounds.lo, wide.bounds.lo)
+
+
+FINE = ("field.encoding.min_spacing=1", "field.encoding.finest=512", "field.encoding.log2_size=8", "batches.rays=64")
+
+
+@pytest.mark.parametrize("changes", [{"size": 12}, {"train_views": 5}, {"pose_noise": 8.0}])
+@pytest.mark.parametrize("method", ["volumetric/hash", "planes/mpi"])
+def test_a_field_as_fine_as_its_training_pictures_is_loaded_as_it_was_fitted(
+    method: str, changes: dict[str, float], tmp_path: Path
+) -> None:
+    """Its sizes are those of the pictures that the fit saw, not of the scene as loaded."""
+    facing = ig.save_scene(toy_scene(views=10, size=24, facing="forward"), tmp_path / "facing.npz")
+    overrides = FINE if method == "volumetric/hash" else ("field.count=4",)
+    request = FitRequest(
+        method=method,
+        scene=str(facing),
+        out=str(tmp_path / "run"),
+        budget="20steps",
+        overrides=(*overrides, *(f"data.{name}={value}" for name, value in changes.items())),
+    )
+    run = fit_run(request)
+    scored = RunFolder(run).read_scores().quality["psnr"].per_view
+    assert evaluate_run(run, protocol="float").quality["psnr"].per_view == pytest.approx(scored, abs=0.02)

@@ -58,7 +58,7 @@ def test_samples_with_wider_registers(processor: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["fields", "pictures"])
+@pytest.mark.parametrize("part", ["hashing", "fields", "pictures"])
 @pytest.mark.parametrize("processor", ["nehalem", "haswell", "skylake-avx512"])
-def test_fields_and_pictures(processor: str, part: str, tmp_path: Path) -> None:
+def test_what_takes_longer_to_compile(processor: str, part: str, tmp_path: Path) -> None:
     finish(start(part, processor, tmp_path), part, processor)

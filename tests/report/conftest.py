@@ -52,9 +52,13 @@ def pristine_study(once: Once) -> Path:
 
 
 @pytest.fixture
-def small_study(tmp_path: Path) -> Path:
+def small_study(tmp_path: Path, once: Once) -> Path:
     """A study of four cells, one of which failed."""
-    return write_study(tmp_path / "small", {"balls": (0,)}, {"data.train_views": [40, 20]}, (0, 1), {1: "failed"})
+
+    def write(folder: Path) -> None:
+        write_study(folder / "small", {"balls": (0,)}, {"data.train_views": [40, 20]}, (0, 1), {1: "failed"})
+
+    return shutil.copytree(once("small-study", write) / "small", tmp_path / "small")
 
 
 @pytest.fixture(scope="session")

@@ -221,6 +221,25 @@ def test_photographs_lie_beside_the_model_or_below(tmp_path: Path, place: str) -
     assert_dots_are_found(scene)
 
 
+@pytest.mark.parametrize("given", [".", "images"])
+def test_a_link_to_another_workspace_s_model_takes_the_photographs_beside_it(tmp_path: Path, given: str) -> None:
+    root = mixed(tmp_path / "garden")
+    variant = tmp_path / "darker"
+    (variant / "images").mkdir(parents=True)
+    for photo in (root / "images").iterdir():
+        Image.open(photo).point(lambda value: value // 2).save(variant / "images" / photo.name)
+    (variant / "sparse").symlink_to(root / "sparse", target_is_directory=True)
+    full, half = (Colmap().load(path, SceneOptions()).train[0].image.float() for path in (root, variant / given))
+    assert float(half.mean()) == pytest.approx(float(full.mean()) / 2, rel=0.05)
+
+
+def test_photographs_may_be_a_link(tmp_path: Path) -> None:
+    root = mixed(tmp_path / "garden")
+    (root / "images").rename(tmp_path / "DCIM")
+    (root / "images").symlink_to(tmp_path / "DCIM", target_is_directory=True)
+    assert_dots_are_found(Colmap().load(root / "images", SceneOptions()))
+
+
 def test_the_fullest_folder_of_photographs_is_taken(tmp_path: Path) -> None:
     root = mixed(tmp_path / "garden")
     (root / "images").rename(root / "input")

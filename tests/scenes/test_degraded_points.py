@@ -102,6 +102,17 @@ def test_tracks_name_the_photographs_that_show_a_point(plane: Scene, blank: int)
         assert view.landmarks is not None and torch.equal(view.landmarks, found.points.position[rows])
 
 
+def test_nothing_is_found_where_masks_are_false(plane: Scene) -> None:
+    """The left half of each picture: no point has a track there; the others are the plane's."""
+    mask = torch.arange(SIZE).expand(SIZE, SIZE) >= SIZE // 2
+    train = tuple(replace(view, mask=mask) for view in plane.train)
+    found = sfm.triangulated(plane.with_views(train=train))
+    assert 20 < len(found.points) < len(sfm.triangulated(plane).points), "masks are part of what points are cached by"
+    for view, rows in zip(train, found.observed, strict=True):
+        place, _ = view.camera.project(found.points.position[rows].double())
+        assert bool((place[:, 0] > SIZE // 2 - 2).all())
+
+
 def tensors(value: object, path: str = "") -> dict[str, torch.Tensor]:
     """Every tensor in a scene, by its path."""
     if isinstance(value, torch.Tensor):

@@ -54,6 +54,21 @@ def test_a_resized_pixel_counts_if_all_of_it_does(folder: Path) -> None:
     assert torch.equal(mask.all(dim=0), torch.arange(100) >= 25)
 
 
+def test_a_view_whose_mask_leaves_no_pixel_of_the_size_is_left_out(folder: Path) -> None:
+    """A sliver of one column, which counts at full size: no pixel of a picture of a quarter of it lies inside."""
+    sliver = np.zeros((120, 160), np.uint8)
+    sliver[:, 77] = 255
+    save(sliver, folder / "masks" / "sliver.png")
+    edit(folder, lambda table: [frame.update(mask_path="masks/sliver.png") for frame in table["frames"][:2]])
+    assert len(load(folder).train) == 7
+    small = load(folder, size=40)
+    assert [view.name for view in small.train] == [f"images/{index:04}.png" for index in range(1, 7)]
+    assert small.notes["masked_views"] == "2 without a valid pixel are left out: images/0007.png, images/0008.png"
+    edit(folder, lambda table: [frame.update(mask_path="masks/sliver.png") for frame in table["frames"]])
+    with pytest.raises(InputError, match="leave no pixel of any training view"):
+        load(folder, size=40)
+
+
 def test_masks_are_undistorted_with_their_photographs(folder: Path) -> None:
     straight = load(folder).train[0].mask
     edit(folder, lambda table: table.update(DISTORTED))

@@ -221,10 +221,26 @@ def test_the_file_s_own_split_is_kept(tmp_path: Path) -> None:
         ({"test_filenames": ["images/none.png"]}, "which no frame has"),
         ({"test_filenames": "images"}, "is not a list of file names"),
         ({"train_filenames": rest, "test_filenames": [name(4)]}, "both to fit and to score"),
-        ({"train_filenames": rest}, "no photographs to score"),
     ):
         with pytest.raises(InputError, match=sentence):
             names(**wrong)
+    for without in ({"train_filenames": rest}, {"train_filenames": [], "val_filenames": [], "test_filenames": []}):
+        assert names(**without)[2] == [name(0), name(8)], "every eighth, where the file names none to score"
+
+
+def test_the_end_of_a_full_turn_is_no_training_view_of_its_beginning(tmp_path: Path) -> None:
+    eyes = ring(9)
+    write(tmp_path, [*eyes, eyes[0], eyes[3]], {})
+    scene = validate(Nerfstudio().load(tmp_path, SceneOptions()))
+    assert [view.name[-8:-4] for view in scene.test] == ["0000", "0008"]
+    assert [view.name[-8:-4] for view in scene.train] == ["0001", "0002", "0003", "0004", "0005", "0006", "0007", "0010"]
+    assert scene.notes["split"] == "every 8th photograph by name; 1 with the pose of one of them are left out"
+
+
+def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path, ring(9), {}) / "transforms.json"
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert_dots_are_found(Nerfstudio().load(tmp_path, SceneOptions()))
 
 
 def test_local_frame(tmp_path: Path) -> None:
@@ -409,7 +425,13 @@ def test_transparent_corners_may_be_what_undistortion_left(tmp_path: Path) -> No
         rgba[..., :3] = np.random.default_rng(0).uniform(0, 255, (120, 160, 3))
         rgba[:20, :20, 3] = 0
         save(rgba, file)
-    assert Nerfstudio().load(path, SceneOptions()).bounds.space == "contracted"
+    scene = validate(Nerfstudio().load(path, SceneOptions()))
+    assert scene.bounds.space == "contracted"
+    # Something is there, but not in the picture: not to be fitted or scored as empty.
+    assert not scene.has_alpha and scene.notes["alpha"] == "transparent pixels (2.1 %) are masked"
+    for view in (*scene.train, *scene.test):
+        assert view.mask is not None
+        assert not view.mask[:20, :20].any() and int(view.mask.sum()) == 120 * 160 - 400
 
 
 def side_by_side() -> list[Eye]:

@@ -114,6 +114,11 @@ def test_another_size_keeps_no_geometry(tmp_path):
     assert "12x8 to 6x4" in scene.notes["resize"]
 
 
+def test_noise_falls_with_the_pixels_that_are_averaged(tmp_path):
+    full, half = (Truth().load(_write(tmp_path), SceneOptions(size=size)).noise_ceiling for size in (None, 6))
+    assert full == pytest.approx(41.5) and half == pytest.approx(41.5 + 20 * np.log10(2))  # of four independent pixels
+
+
 @pytest.mark.parametrize("damage", ["json", "schema", "missing", "short", "camera"])
 def test_damage_is_reported(tmp_path, damage):
     folder = _write(tmp_path)

@@ -95,6 +95,10 @@ def test_folders_are_named_by_what_defines_the_run(study, tmp_path: Path) -> Non
     turned = HASH + f'[factors]\n{SAMPLES} = [128, 64]\n"{TABLE}" = [14, 12]\n'
     hashes = {planned.id[-10:] for planned in make_plan(study(turned), request)}
     assert hashes == {name[-10:] for name in ids[2:]}
+    made = tmp_path / "runs" / ids[3]
+    made.mkdir(parents=True)
+    assert ids[3] in {planned.id for planned in make_plan(study(turned), request)}, "what is finished is found again"
+    made.rmdir()
     noisy = make_plan(study(HASH + TWO + "[base]\ndata.photo_noise = 0.1\n"), request)
     longer = make_plan(study('budget = "61s"\n' + HASH + TWO), request)
     assert not {p.id[-10:] for p in (*noisy, *longer)} & {name[-10:] for name in ids}

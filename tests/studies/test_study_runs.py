@@ -116,6 +116,17 @@ def test_a_study_runs_once_and_then_does_nothing(executor, request_of) -> None:
     assert len(executor.made) == 2 and all("seed=2" in name for name in executor.made)
 
 
+def test_finished_fits_of_other_threads_are_not_replaced_unasked(executor, request_of, monkeypatch) -> None:
+    request = request_of()
+    ablate(request, _yes)
+    executor.made.clear()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
+    with pytest.raises(InputError, match=r"its number of threads is \d+, not 7\.\nGive the same --jobs, add --keep"):
+        ablate(request, _yes)
+    ablate(replace(request, keep=True), _yes)
+    assert not executor.made
+
+
 def test_interrupted_it_goes_on(executor, request_of) -> None:
     request = request_of()
 

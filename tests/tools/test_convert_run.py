@@ -201,6 +201,9 @@ def test_a_converted_run_is_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[
     for to, method in (("gaussians", "volumetric/nerf"), ("mesh", "splatting/gaussians")):
         with pytest.raises(InputError, match=f"--method {method} has another field than --to {to} makes"):
             convert_run(ConvertRequest(run=native, to=to, out=tmp_path / "other", method=method))
+    for method, hook in (("splatting/gaussians-mcmc", "relocation"), ("splatting/gaussians-mip", "smoothing")):
+        with pytest.raises(InputError, match=f"--method {method} relies on its hook '{hook}'"):
+            convert_run(ConvertRequest(run=native, to="gaussians", out=tmp_path / "other", method=method))
     out = tmp_path / "gaussians"
     command = ["convert", str(native), "--to", "gaussians", "--size", "300", "--refit", "30steps", "--out", str(out)]
     assert main.run(command) == 0

@@ -242,9 +242,16 @@ def test_gaussians_start_from_another_run(toy_folder: Path, tmp_path: Path) -> N
         again[seed] = config.converted(fitted.model.field, fitted.scene).means
     assert torch.equal(means, again[0])
     assert not torch.equal(means, again[1])
+    refined = ("training.poses.optimise=true", "training.poses.test_steps=2")
+    moved = fit_run(_request(toy_folder, tmp_path / "moved", **(first | {"overrides": (*first["overrides"], *refined)})))
     features = ("field.width=8", "field.features=8", "renderer.features=8", "renderer.width=8", "batches.rays=64")
     without = fit_run(_request(toy_folder, tmp_path / "srn", method="learned/srn", budget="1steps", overrides=features))
-    for wrong, words in ((tmp_path / "none", "is not a run"), (without, "not density and radiance")):
+    wrongs = (
+        (tmp_path / "none", "is not a run"),
+        (without, "not density and radiance"),
+        (moved, "has refined its cameras' poses"),
+    )
+    for wrong, words in wrongs:
         items = (*SMALL[METHOD], "field.init=field", f"field.source={wrong}")
         with pytest.raises(InputError, match=words):
             fit_run(_request(toy_folder, tmp_path / "other", budget="1steps", overrides=items))

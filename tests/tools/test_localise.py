@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -111,6 +112,15 @@ def test_wrong_use_gets_a_sentence(arguments: list[str], said: str, run: Path, t
     photo = toy_folder / "test" / "r_0.png"
     assert command(["locate", str(run), str(photo), *arguments]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", ["photo.json", "photo.png"])
+def test_the_photograph_is_not_overwritten(out: str, run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:
+    """The pictures lie beside the result, under its name."""
+    photo = Path(shutil.copy(toy_folder / "test" / "r_0.png", tmp_path / "photo.png"))
+    before = photo.read_bytes()
+    assert command(["locate", str(run), str(photo), "--out", str(tmp_path / out)]) == 2
+    assert "cannot be" in capsys.readouterr().err and photo.read_bytes() == before
 
 
 def test_unreadable_photographs_and_no_runs(run: Path, tmp_path: Path, capsys) -> None:

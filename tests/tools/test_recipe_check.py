@@ -51,11 +51,13 @@ def test_a_report_is_current_until_its_recipe_changes(tmp_path: Path, capsys: py
 
 
 def test_runs_of_no_recipe_alone_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Imported and converted ones, and pages without runs, such as a benchmark's."""
+    """Imported and converted ones, renderings of fits, and pages without runs, such as a benchmark's."""
     write(tmp_path / "mixed" / "runs" / "0", **current())
     imported = {"file": "a.ply", "sha256": "0" * 64, "bytes": 9, "format": "ply", "axes": "opencv", "world": "opencv"}
     imported |= {"gaussians": 1, "sh_degree": 0, "antialiased": None, "notes": []}
     write(tmp_path / "mixed" / "runs" / "1", **(current() | {"budget": "imported", "imported": imported}))
+    shown = {"method": f"{METHOD} rendered with gaussian-volume/exact", "fitted_run": "../..", "fitted_by": METHOD}
+    write(tmp_path / "mixed" / "runs" / "0" / "rendered" / "exact", **(current() | shown))
     assert check_recipes(tmp_path / "mixed").current
     assert check_recipes(tmp_path / "mixed").runs == 1
     for name in ("mixed", "bench"):

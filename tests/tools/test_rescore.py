@@ -124,6 +124,14 @@ def test_scores_go_into_the_run_and_never_replace_its_own(run: Path) -> None:
     assert {"flip", "alpha_iou"} <= set(read_run(run, "float").scores.quality)
 
 
+def test_a_run_that_was_interrupted_before_its_scores_stays_unfinished(run: Path) -> None:
+    """The default protocol's scores mark a run as finished; these would lack its costs."""
+    (run / "scores.json").unlink()
+    result = rescore([open_pictures(run)], protocols_named("default,float"))[0]
+    assert [path.name for path in write_scores(result, None)] == ["scores.float.json"]
+    assert not (run / "scores.json").exists()
+
+
 def test_pictures_of_another_tool_score_like_the_run_they_came_from(run: Path, tmp_path: Path) -> None:
     truth_folder = run / json.loads((run / "provenance.json").read_text())["truth"]
     theirs = tmp_path / "model" / "test" / "ours_30000"

@@ -8,7 +8,9 @@ import torch
 
 from invgraphics.core import Bounds, Camera, Context, Quantity, Scene, Screen, Trace, View
 from invgraphics.core.transforms import look_at
+from invgraphics.errors import InputError
 from invgraphics.fields.gaussian import GaussianFieldConfig
+from invgraphics.renderers.gaussians.volume import GaussianExactConfig
 from invgraphics.renderers.splatting import SplattingConfig
 from invgraphics.training.density_control import DensityControlConfig
 from invgraphics.training.hooks import FitState
@@ -234,7 +236,7 @@ def test_white_scenes_are_not_reset_before_gaussians_can_recover(step: int, lowe
     """3DGS resets after 500 of 30,000 steps; in a budget of a few that share of it would leave nothing to see."""
     state = _state(3)
     state.scene = replace(state.scene, background=torch.ones(3))
-    state.step, state.ctx = step, replace(state.ctx, progress=0.5)
+    state.step, state.ctx = step, replace(state.ctx, progress=0.4)
     _end_step(state, DensityControlConfig(every=1000, start=0.0167, white_reset=True, reset_spacing=3000).build())
     assert (float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02) == lowered
 
@@ -331,6 +333,27 @@ def test_no_reset_where_density_control_is_off() -> None:
         state.step, state.ctx = step, replace(state.ctx, progress=progress)
         _end_step(state, hook)
     assert float(torch.sigmoid(state.field.opacity_logits).min()) == pytest.approx(0.5)
+
+
+def test_no_reset_after_density_control_has_ended() -> None:
+    """As in 3DGS's code: what a reset lowers would never be pruned."""
+    state, hook = _state(3), DensityControlConfig(start=0.0, stop=0.2, every=10_000, resets=(0.1, 0.3)).build()
+    lowered = []
+    for step, progress in ((700, 0.15), (900, 0.35)):
+        with torch.no_grad():
+            state.field.opacity_logits.fill_(0.0)
+        state.step, state.ctx = step, replace(state.ctx, progress=progress)
+        _end_step(state, hook)
+        lowered.append(float(torch.sigmoid(state.field.opacity_logits).max()) < 0.02)
+    assert lowered == [True, False]
+
+
+def test_rays_do_not_grow_gaussians() -> None:
+    """They have no gradients on a screen: the hook would do nothing but its resets."""
+    state, hook = _state(3), DensityControlConfig().build()
+    with pytest.raises(InputError, match="'density_control' needs a renderer that splats"):
+        hook.check_fit(state.field, GaussianExactConfig().build(state.scene))
+    hook.check_fit(state.field, SplattingConfig().build(state.scene))
 
 
 def test_large_gaussians_stay_until_a_reset_has_happened() -> None:

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from other_device import Elsewhere, other_device
+from test_lattice_methods import BATCH, SAMPLER, SHRUNK
 
 from invgraphics.experiments.build import build_plan
 from invgraphics.experiments.recorder import Monitor
@@ -13,7 +14,7 @@ SPARSE = ["field.encoding.resolution=8", "field.appearance.resolution=8", "hooks
 METHODS = {
     "volumetric/nerf": [],
     "volumetric/hash": [],
-    "volumetric/tensorf-vm": [],
+    "volumetric/tensorf-vm": [*SHRUNK["volumetric/tensorf-vm"], *SAMPLER, *BATCH],
     "volumetric/plenoxels": SPARSE,
     "splatting/gaussians": [],
 }

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from tracked_plane import SIZE, photographs, workspace
+from training_fixtures import SMALL
 
 from invgraphics.core import Bounds, Camera, Context, FieldValues, RayRenderer, Rays, Rendering, Samples, Scene, Trace, View
 from invgraphics.errors import InputError
@@ -174,7 +175,8 @@ def test_points_mend_the_depth_of_a_plane_in_few_photographs(tmp_path: Path) -> 
 
     def error(*changes: str) -> float:
         """Mean relative error of the depth that the plane's rays of a test view have."""
-        plan = build_plan(load_method("volumetric/hash", overrides=list(changes)), scene, Budget(None, 120), 0, CPU)
+        fewer = ["batches.rays=512", "batches.samples=8192"]
+        plan = build_plan(load_method("volumetric/hash", overrides=[*fewer, *changes]), scene, Budget(None, 120), 0, CPU)
         fit = Fit(plan)
         fit.run(lambda loss: False)
         camera = scene.test[0].camera
@@ -192,11 +194,12 @@ def test_points_mend_the_depth_of_a_plane_in_few_photographs(tmp_path: Path) -> 
 
 def test_a_run_says_that_points_supervise_depth_and_how_not_to(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     scene = str(workspace(tmp_path / "plane", [1.0] * 10))
-    request = FitRequest(method="volumetric/hash", scene=scene, budget="2steps", out=str(tmp_path / "run"))
+    small = tuple(SMALL["volumetric/hash"])
+    request = FitRequest(method="volumetric/hash", scene=scene, budget="2steps", out=str(tmp_path / "run"), overrides=small)
     folder = RunFolder(fit_run(request))
     said = capfd.readouterr().err
     assert "training photographs end at points of structure from motion, unless --set training.sparse_depth.weight=0" in said
     assert "end at points" in folder.read(Provenance).sparse_depth
-    changes = ("training.sparse_depth.weight=0",)
+    changes = (*small, "training.sparse_depth.weight=0")
     folder = RunFolder(fit_run(replace(request, overrides=changes, out=str(tmp_path / "without"))))
     assert "depth: " not in capfd.readouterr().err and folder.read(Provenance).sparse_depth == ""

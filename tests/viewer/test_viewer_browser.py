@@ -132,7 +132,7 @@ def watch(browser: Any, tmp_path: Path, request: pytest.FixtureRequest) -> Itera
     opened: list[Any] = []
 
     def start(*runs: Path) -> Watcher:
-        viewer = open_viewer(ViewerConfig(runs, port=0, max_size=160), print)
+        viewer = open_viewer(ViewerConfig(runs, port=0, max_size=96), print)
         opened.append(viewer.stop)
         context = browser.new_context(viewport=WINDOW)
         opened.append(context.close)
@@ -343,9 +343,10 @@ def test_a_fit_is_followed(watch: Any, runs: dict[str, Path], tmp_path: Path) ->
     watcher.page.get_by_text("step 12,345").wait_for(timeout=PATIENCE)
     watcher.page.wait_for_timeout(500)
     watcher.rest()
-    assert _apart(watcher.canvas("followed"), before) > 2
+    followed = watcher.canvas("followed")
+    assert _apart(followed, before) > 2
     (run / CHECKPOINT).write_bytes(b"broken")
     watcher.viewer.reload_if_changed()
     watcher.page.get_by_text("is not a readable checkpoint").wait_for(state="attached", timeout=PATIENCE)
-    assert _apart(watcher.canvas()[120:], watcher.canvas()[120:]) < 1
+    assert _apart(watcher.canvas()[120:], followed[120:]) < 1, "what was there is still shown"
     assert watcher.complaints == []

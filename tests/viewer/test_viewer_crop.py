@@ -11,6 +11,8 @@ import torch
 
 from invgraphics.core import Bounds, Context, Quantity, Rays, Renderer
 from invgraphics.experiments.fitted import open_fitted
+from invgraphics.renderers.ray_attention import RayAttentionConfig
+from invgraphics.renderers.srn import SRNConfig
 from invgraphics.testing import toy_scene
 from invgraphics.viewer.crop import CropBox, CroppedGaussians, crop_note, crop_obstacle
 from invgraphics.viewer.loaded_run import LoadedRun
@@ -101,4 +103,7 @@ def test_what_cannot_be_cropped_says_why() -> None:
 
     assert crop_obstacle(Meshes()) == "Meshes cannot be cropped: it renders mesh, neither Gaussians nor rays."
     assert crop_note(Meshes()) == crop_obstacle(Meshes())
+    toy = toy_scene(views=2, size=8)
+    for learned in (RayAttentionConfig(), SRNConfig()):  # of rays through the whole box
+        assert "cannot be cropped: it has learnt from rays through all" in crop_obstacle(learned.build(toy))
     assert toy_scene(views=2, size=8).bounds.crop is None

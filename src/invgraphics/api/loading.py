@@ -22,7 +22,7 @@ from invgraphics.experiments.session import FolderRun
 from invgraphics.files import write_text
 from invgraphics.recipes import recipe
 from invgraphics.recipes.recipe import Method
-from invgraphics.runs.folder import RunFolder, check_run
+from invgraphics.runs.folder import SCENE_COPY, RunFolder, check_run
 from invgraphics.scenes.npz import save_npz, unsupported_parts
 from invgraphics.scenes.open import SceneOptions, open_scene, source_of, validate
 from invgraphics.studies.factors import override
@@ -245,7 +245,7 @@ def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]
     if source is not None and (source.options.train_views, source.options.seed) == (None, 0):
         options = source.options
         return scene, {"scene": source.spec, "size": options.size, "test_views": options.test_views, "spp": options.spp}
-    path, present = folder / "scene.npz", (folder / "scene.npz").is_file()
+    path, present = folder / SCENE_COPY, (folder / SCENE_COPY).is_file()
     if not present:
         save_npz(scene, path)
     elif beyond := unsupported_parts(scene):

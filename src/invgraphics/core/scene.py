@@ -182,9 +182,15 @@ class Scene:
 
     @property
     def is_interior(self) -> bool:
-        """Whether it is seen from within: every training camera is in a box, which a contracted space is not."""
-        positions = [view.camera.position for view in self.train]
-        return self.bounds.space == "box" and bool(positions) and bool(self.bounds.contains(torch.stack(positions)).all())
+        """Whether it is seen from within: all training cameras are in the box, or in endless space most look outwards."""
+        if not self.train:
+            return False
+        poses = torch.stack([view.camera.cam_to_world for view in self.train])
+        if self.bounds.space == "box":
+            return bool(self.bounds.contains(poses[:, :3, 3]).all())
+        offset = poses[:, :3, 3] - self.bounds.centre
+        outwards = (offset * poses[:, :3, 2]).sum(dim=1)
+        return bool((offset.norm(dim=1) <= 1.001 * self.bounds.half.min()).all()) and float(outwards.median()) > 0
 
     @property
     def is_class(self) -> bool:

@@ -22,7 +22,7 @@ from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import PictureClock, disturbance, fit_costs
 from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
-from invgraphics.experiments.identity import check_truth, truth_digest
+from invgraphics.experiments.identity import truth_digest
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.experiments.scaled import scaled_scores
@@ -225,7 +225,6 @@ def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "defa
         InputError: the folder holds no run, its checkpoint does not fit its recipe, or the scene has other test views.
     """
     fitted = open_fitted(run, scene_spec)
-    check_truth(fitted.folder, fitted.scene, scene_spec)
     with fitted.folder.held():
         return _evaluate_fitted(fitted, protocol)
 

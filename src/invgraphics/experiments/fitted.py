@@ -10,10 +10,11 @@ from typing import Any
 import torch
 
 from invgraphics import plugins
+from invgraphics.config import fill
 from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, device_of
-from invgraphics.experiments.identity import check_truth
+from invgraphics.experiments.identity import check_truth, kept_scene
 from invgraphics.experiments.job import in_region
 from invgraphics.experiments.posed import refined_poses, scene_in_fit_frame
 from invgraphics.kernels.allocator import keep_freed_memory
@@ -22,6 +23,7 @@ from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.provenance import Provenance
+from invgraphics.scenes.degrade import KEEP, TrainingData, degrade
 from invgraphics.scenes.open import SceneOptions, is_found, open_scene
 from invgraphics.training.poses import Poses
 
@@ -77,20 +79,20 @@ def open_fitted(run: Path, scene_spec: str | None = None) -> Fitted:
     """Open a run, on its own scene or on another copy of it.
 
     Raises:
-        InputError: the folder holds no run, its scene cannot be opened, or its checkpoint does not fit its recipe; or another
-            copy of the scene has other test views.
+        InputError: the folder holds no run, its scene cannot be opened or has other test views today, or its checkpoint does
+            not fit its recipe.
     """
     torch.set_flush_denormal(True)  # as in fits (`build.configure_torch`), before the scene is opened and threads start
     folder = RunFolder(run)
     provenance = folder.read(Provenance)
     chosen = provenance.options
     options = SceneOptions(chosen.size, chosen.test_views, spp=None if scene_spec else chosen.spp)
-    if scene_spec is None and not is_found(provenance.scene):
+    own = provenance.scene if (kept := kept_scene(folder, provenance.scene)) is None else str(kept)
+    if scene_spec is None and not is_found(own):
         sentence = f"The scene of {run}, '{provenance.scene}', is not found from here."
         raise InputError(sentence, "Give its path with --scene, or work where the run was fitted.")
-    scene = open_scene(scene_spec or provenance.scene, options)
-    if scene_spec is not None:
-        check_truth(folder, scene, scene_spec)
+    scene = open_scene(scene_spec or own, options)
+    check_truth(folder, scene, scene_spec)
     return load_fitted(folder, scene)
 
 
@@ -106,15 +108,28 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     method = replace(_method(folder, provenance), preset_choice=provenance.preset_choice)
     device = device_of("cuda" if provenance.device.startswith("cuda") and torch.cuda.is_available() else "cpu")
     source = folder.fit(provenance)
-    scene = in_region(scene, source.read(Provenance).region)
-    model = build_model(method, scene, provenance.seed, device, shown=provenance.fitted_run is not None)
+    region = source.read(Provenance).region
+    trained = in_region(_as_sampled(scene, provenance), region)
+    model = build_model(method, trained, provenance.seed, device, shown=provenance.fitted_run is not None)
     if provenance.fitted_run is not None:
         model = replace(model, renderer=model.renderer.untrained())
     state = checkpoint.load(source.checkpoint, device)
     try:
-        return Fitted(folder, method, scene, model, source).at_checkpoint(state)
+        return Fitted(folder, method, in_region(scene, region), model, source).at_checkpoint(state)
     except RuntimeError as error:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
+
+
+def _as_sampled(scene: Scene, provenance: Provenance) -> Scene:
+    """The scene with the training cameras that a fit had, of which the sizes of some fields are made."""
+    data = fill(TrainingData, provenance.data)
+    kept = replace(data, init="random", background=KEEP, photo_noise=0.0, exposure=0.0)  # what changes no camera
+    if not kept.changes_photographs and not kept.pose_noise and kept.scales == (1,):
+        return scene
+    try:
+        return replace(degrade(scene, kept, provenance.data_seed), points=scene.points)
+    except InputError:  # another copy of the scene has fewer photographs, or smaller ones
+        return scene
 
 
 def _method(folder: RunFolder, provenance: Provenance) -> Method:

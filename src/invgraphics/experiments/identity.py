@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
+import os
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.job import Job
 from invgraphics.runs.fit import FitRecord
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import SCENE_COPY, SHARED_ABOVE, RunFolder
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.open import is_rendered
 from invgraphics.text import sha256_of
@@ -104,7 +106,7 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
         return
     found, request = folder.read(Provenance), job.request
     settings = {
-        "scene": (found.scene, request.scene),
+        "scene": (found.scene, found.scene if _same_scene(folder, found.scene, request.scene) else request.scene),
         "seed": (found.seed, request.seed),
         "budget": (_normalised(found.budget), str(job.budget)),
         "size": (found.options.size, request.size),
@@ -120,7 +122,29 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
     for name, (theirs, ours) in settings.items():
         if theirs != ours:
             sentence = f"{folder.root} holds another run: its {name} is {theirs}, not {ours}."
-            raise InputError(sentence, "Choose another --out, or delete that folder.")
+            remedy = "Choose another --out, or delete that folder."
+            raise InputError(sentence, f"Give the same --set data.KEY=VALUE. {remedy}" if name == "training data" else remedy)
+
+
+def kept_scene(folder: RunFolder, name: str) -> Path | None:
+    """Find the copy of a scene made in Python that lies in a run or in its comparison; ``None`` for other scenes.
+
+    Args:
+        folder: of the run.
+        name: of the scene, as the run has it: the copy's path from where the fit was made.
+    """
+    if Path(name).name != SCENE_COPY:
+        return None
+    places = [folder.root, *itertools.islice(folder.root.absolute().parents, SHARED_ABOVE)]
+    return next((place / SCENE_COPY for place in places if (place / SCENE_COPY).is_file()), None)
+
+
+def _same_scene(folder: RunFolder, *names: str) -> bool:
+    """Whether names are spellings of one scene: as copies in a run's folder, or as paths."""
+    paths = [Path(name) for name in names]
+    places = [path if path.exists() else kept_scene(folder, str(path)) or path for path in paths]
+    existing = all(place.exists() for place in places) and not any(map(is_rendered, names))
+    return len({place.resolve() if existing else os.path.normpath(place) for place in places}) == 1
 
 
 def other_run(folder: RunFolder, method: str) -> InputError:
@@ -182,7 +206,7 @@ def check_truth(folder: RunFolder, scene: Scene, spec: str | None) -> None:
 def cell_digest(job: Job) -> str:
     """Hash the settings of a study's cell, independent of machine and code version."""
     request = job.request
-    scene = {key: getattr(request, key) for key in ("scene", "size", "test_views")}
+    scene = {"scene": os.path.normpath(request.scene)} | {key: getattr(request, key) for key in ("size", "test_views")}
     scene |= {} if request.spp is None else {"spp": request.spp}  # so that studies without keep their folders' names
     scene |= {"protocol": request.protocol}
     parts = {"method": job.method.name, "recipe": job.method.digest, "data": job.data.changes()}

@@ -60,7 +60,9 @@ def renderings_complete(job: Job) -> bool:
         record = job.folder.read(Renderings)
     except InputError:
         return False
-    return record.identity == _identity(job.folder, job.variants, job.method)
+    same = record.identity == _identity(job.folder, job.variants, job.method)
+    places = [RunFolder(job.folder.root / one.run) for one in record.renderings]
+    return same and all(place.scores_path(protocol).is_file() for place in places for protocol in job.protocols)
 
 
 def is_kept(job: Job) -> bool:
@@ -105,11 +107,14 @@ def render_missing(job: Job, scene: Scene) -> None:
 def _render(
     folder: RunFolder, fit: RunFolder, model: tuple[Method, RendererVariant], scene: Scene, protocols: Sequence[str]
 ) -> None:
-    """Render and score the fit by one renderer, unless that was done before."""
+    """Render and score the fit by one renderer, under the protocols under which that was not done before."""
     method, variant = model
     seen = with_renderer(method, variant)
     identity = sha256_of([fit.identity, variant.digest])
     if folder.finished and folder.identity == identity:
+        for rules in protocols:
+            if not folder.scores_path(rules).is_file():
+                evaluate_saved(folder, scene, rules)
         return
     folder.create()
     folder.clear()

@@ -107,7 +107,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         use_kernels(request.kernels, job.device)
         began_at = load_average()
         with PeakMemory(job.device) as memory:
-            fit = prepare(job, training_scene)
+            fit = prepare(job, training_scene, scene)
             resumed = same and folder.resumable
             earlier = _resumed(fit, job) if resumed else None
             forecast = warm_up(fit, method, memory)  # which may refuse: the folder is as it was until then
@@ -150,14 +150,14 @@ def _resumed(fit: Fit, job: Job) -> FitRecord:
     return earlier
 
 
-def prepare(job: Job, training_scene: Scene) -> Fit:
-    """Build a job's fit, before its first step, on the degraded training data.
+def prepare(job: Job, training_scene: Scene, scene: Scene) -> Fit:
+    """Build a job's fit, before its first step, on the degraded training data of a scene as loaded.
 
     Raises:
         InputError: method and scene do not go together, or what the method starts from cannot be used.
     """
     plan = build_plan(job.method, training_scene, job.budget, job.request.seed, job.device)
-    return Fit(initialise_field(plan, job.method, job.request.scene))
+    return Fit(initialise_field(plan, job.method, job.request.scene, scene))
 
 
 def warm_up(fit: Fit, method: Method, memory: PeakMemory) -> MemoryForecast:

@@ -146,7 +146,7 @@ class MemoryRun(FittedRun):
         with PeakMemory(job.device) as memory:
             shown = make_training_scene(job, scene)
             self.scene = in_region(scene, region_of(shown))
-            self.fit = prepare(job, shown)
+            self.fit = prepare(job, shown, scene)
             warm_up(self.fit, job.method, memory)
         self._run()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,16 +10,18 @@ from pathlib import Path
 import torch
 
 from invgraphics import locks
-from invgraphics.core import Field, RayRenderer
+from invgraphics.core import Field, RayRenderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.memory_check import COPIES, RAY_BYTES, TRAINED_COPIES, upsampled_bytes
 from invgraphics.experiments.progress import warn
+from invgraphics.fields.gaussian import GaussianField
 from invgraphics.fields.mesh import MeshFieldConfig
 from invgraphics.formats.mesh import mesh_from_file
 from invgraphics.memory import total_bytes
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
+from invgraphics.renderers.splatting import Splatting
 from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches, size_of
@@ -30,6 +33,8 @@ PICTURE_BYTES = 300
 """Of a pixel of a training picture: rendering, truth, SSIM's moments, and their gradients."""
 CHECKPOINT_COPIES = 3
 """A checkpoint holds each parameter and Adam's two moments."""
+DISC_THICKNESS = 1e-3
+"""Of the axis that discs drop at the start of a fit, over their width: shorter than the others will become."""
 MARGIN = 1.25
 """Memory that is freed and allocated again in other sizes leaves gaps."""
 GROWTH_MARGIN = 1.5
@@ -78,8 +83,14 @@ def check_losses(fit: Fit, method: Method) -> None:
         warn(f"Warning: the loss '{name}' is 0 throughout: this renderer gives it nothing to act on.")
 
 
-def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
-    """Initialise the plan's field by conversion from the run that the recipe's ``field.source`` names, if any.
+def initialise_field(plan: Plan, method: Method, scene_spec: str, scene: Scene) -> Plan:
+    """Initialise the plan's field: from the run that the recipe's ``field.source`` names, if any, and flat if it is of discs.
+
+    Args:
+        plan: of the fit.
+        method: its recipe.
+        scene_spec: name of its scene.
+        scene: as loaded, with the photographs that the run may have had.
 
     Raises:
         InputError: there is no such run, it shows another scene, or its field cannot be converted.
@@ -88,15 +99,35 @@ def initialise_field(plan: Plan, method: Method, scene_spec: str) -> Plan:
     source = getattr(config, "source", "")
     check_source(method, scene_spec)
     if not source:
-        return plan
+        return _with_field(plan, plan.model.field)
     if isinstance(config, MeshFieldConfig) and Path(source).is_file():
         return _with_field(plan, config.from_mesh(mesh_from_file(Path(source), plan.scene), plan.scene))
-    source_field = load_fitted(RunFolder(Path(source)), plan.scene).model.field
+    fitted = load_fitted(RunFolder(Path(source)), scene)
+    if fitted.poses is not None:
+        sentence = f"'{source}' has refined its cameras' poses: its field does not lie where this scene's cameras look."
+        raise InputError(sentence, "Start from a run that was fitted without --optimise poses.")
+    source_field = fitted.model.field
     torch.manual_seed(plan.seed)  # loading the source has drawn its own initial values
     return _with_field(plan, config.converted(source_field, plan.scene))
 
 
+@torch.no_grad()
+def flatten_discs(field: GaussianField, plan: Plan) -> None:
+    """Turn Gaussians that a fit is to show as discs into thin ones of random orientation, as 2DGS starts them; in place.
+
+    A disc is spanned by its two longest axes, and the third has no gradient: of three equal ones it would become one of the
+    longest as soon as another shrinks, and the disc would turn over.
+    """
+    renderer = plan.model.renderer
+    if isinstance(renderer, Splatting) and renderer.config.shape == "disc" and not field.isotropic:
+        torch.manual_seed(plan.seed)
+        field.quaternions.copy_(torch.randn(field.quaternions.shape))
+        field.log_scales[:, 2] += math.log(DISC_THICKNESS)
+
+
 def _with_field(plan: Plan, field: Field) -> Plan:
+    if isinstance(field, GaussianField):
+        flatten_discs(field, plan)
     return replace(plan, model=replace(plan.model, field=field.to(plan.device)))
 
 

@@ -125,6 +125,9 @@ class GaussianFieldConfig:
         return GaussianField(tensors, self.isotropic, self.dropout if few else 0.0)
 
 
+GAUSSIAN_QUANTITIES = Quantity.GAUSSIANS | Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL
+
+
 class GaussianField(Field):
     """n Gaussians. Parameters are stored before activation; `primitives` activates them.
 
@@ -137,7 +140,7 @@ class GaussianField(Field):
         dropout: share of Gaussians left out of a training step at the end of a fit, by renderers of `primitives` only.
     """
 
-    provides = Quantity.GAUSSIANS | Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL
+    provides = GAUSSIAN_QUANTITIES
     means: Tensor
     quaternions: Tensor
     log_scales: Tensor
@@ -266,15 +269,17 @@ class GaussianField(Field):
 class FixedGaussians(Field):
     """Field of constant Gaussians, for rendering without fitting."""
 
-    provides = Quantity.GAUSSIANS
+    provides = GAUSSIAN_QUANTITIES
 
     def __init__(self, gaussians: Gaussians) -> None:
         super().__init__()
         self._gaussians = gaussians
 
     def query(self, samples: Samples, want: Quantity) -> FieldValues:
-        """Refuse pointwise queries: this field has primitives only."""
-        raise NotComposableError(f"FixedGaussians has no {want.words()} at points.", "It provides gaussians.")
+        """The Gaussians as one density in space, see `GaussianField.query`."""
+        if lacking := want & ~self.provides:
+            raise NotComposableError(f"FixedGaussians has no {lacking.words()} at points.")
+        return query_density(self._gaussians, samples, want)
 
     def primitives(self, want: Quantity, ctx: Context) -> Gaussians:
         """The Gaussians."""

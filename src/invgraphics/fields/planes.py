@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -191,6 +191,14 @@ class PlaneField(Field):
         self.register_buffer("focal", camera.focal.detach().clone())
         self.register_buffer("centre", camera.principal_point.detach().clone())
         self.register_buffer("depths", depths.detach().clone())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        for name in ("rgb_logits", "alpha_logits", "coefficients"):
+            stored, parameter = state_dict.get(prefix + name), getattr(self, name)
+            if isinstance(stored, Tensor) and parameter is not None and stored.shape[0] == parameter.shape[0]:
+                # Resized in place: how many texels there are follows from the points that a fit had.
+                parameter.data = parameter.new_empty(stored.shape)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     @property
     def camera(self) -> Camera:

@@ -72,12 +72,12 @@ def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Pa
         size=(picture.shape[1], picture.shape[0]),
         protocol={"name": first.scores.protocol},
     )
-    base = Path(os.path.commonpath([path.resolve().parent for path in folders])) if public else out
+    base = None if public else out
     return _write(comparison, out, base, public)
 
 
-def _write(comparison: Comparison, out: Path, base: Path, public: bool) -> Path:
-    """Write all outputs of a comparison into ``out``; tables name runs by their path from ``base``."""
+def _write(comparison: Comparison, out: Path, base: Path | None, public: bool) -> Path:
+    """Write all outputs of a comparison into ``out``; tables name runs by their path from ``base``, if there is one."""
     redactor = None
     if public:
         check_runs_outside(out, [run.folder for run in comparison.runs])

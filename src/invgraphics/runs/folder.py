@@ -37,8 +37,10 @@ RENDERED = "rendered"
 """Folder of a fit's renderings by other renderers, each a run."""
 SHARED_ABOVE = 5
 """Levels above a run at which the folder of runs of its comparison or study is looked for: of METHOD/seed-N/rendered/NAME."""
-TEMPORARY = ("*.tmp", ".tmp??????", "test/*.tmp", "snapshots/*.tmp", "snapshots/.tmp??????")
-"""Files that are being written: ours, and those of safetensors."""
+SCENE_COPY = "scene.npz"
+"""Copy of a scene that was made in Python, in its run or comparison."""
+TEMPORARY = ("*.*.tmp", ".tmp??????", "test/*.*.tmp", "snapshots/*.*.tmp", "snapshots/.tmp??????")
+"""Files that are being written: ours (`NAME.SUFFIX.tmp`), and those of safetensors."""
 PUBLISHED = (RECIPE, scores_file(), history.FILE, Provenance.FILE, Environment.FILE)
 """Files of a run that a report links."""
 
@@ -123,7 +125,8 @@ class RunFolder:
         with locks.locked(self.root, self.root / locks.INSIDE, waiting if wait else None):
             for pattern in TEMPORARY:
                 for left in self.root.glob(pattern):  # by a process that was killed; the lock keeps others out
-                    left.unlink(missing_ok=True)
+                    if left.is_file():
+                        left.unlink(missing_ok=True)
             yield
 
     def path(self, *names: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -49,6 +50,28 @@ def is_object(pictures: Sequence[UInt8[np.ndarray, "h w c"]], black: bool) -> bo
         return True
     colour = plain_border(pictures)
     return colour is not None and (black or float(colour.max()) > SAME_COLOUR / 255)
+
+
+def masking_blank(views: Sequence[View]) -> tuple[list[View], dict[str, str]]:
+    """Views of an endless space, with their few transparent pixels masked: something is there, but not in the picture.
+
+    Returns:
+        The views, and a note where any has changed; as they are where they are transparent around an object.
+    """
+    clear = [0.0 if view.alpha is None else float((view.opacity() < 0.5).float().mean()) for view in views]
+    share = sum(clear) / len(clear)
+    if share >= CLEAR_SHARE or all(view.alpha is None for view in views):
+        return list(views), {}
+    return [_masked(view) for view in views], {"alpha": f"transparent pixels ({100 * share:.2g} %) are masked"}
+
+
+def _masked(view: View) -> View:
+    if view.alpha is None:
+        return view
+    seen = view.opacity() >= 0.5
+    if bool(seen.all()):
+        return replace(view, alpha=None)
+    return replace(view, alpha=None, mask=seen if view.mask is None else view.mask & seen)
 
 
 def background_of(views: Sequence[View]) -> Float[Tensor, 3]:

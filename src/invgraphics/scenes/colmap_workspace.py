@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,7 +44,8 @@ class Model:
 
 def model_folders(path: Path) -> list[Path]:
     """List the folders of COLMAP models in the workspace that ``path`` is, or is a folder of."""
-    root = path.resolve().parent if is_image_folder(path.resolve()) and not _holds_model(path) else path
+    given = _absolute(path)
+    root = given.parent if is_image_folder(given) and not _holds_model(path) else path
     found: dict[Path, Path] = {}
     for place in (*PLACES, *UNDISTORTED):
         for folder in sorted(root.glob(place)) if place != "." else [root]:
@@ -65,7 +67,7 @@ def find_model(path: Path) -> Model:
         raise InputError(
             f"{path} has no COLMAP model.", f"Looked for cameras.bin or cameras.txt in {', '.join((*PLACES, *UNDISTORTED))}."
         )
-    given = path.resolve()
+    given = _absolute(path)
     models, failures = [], []
     for folder in folders:
         try:
@@ -91,6 +93,11 @@ def find_model(path: Path) -> Model:
     return replace(chosen, note=note if others else "")
 
 
+def _absolute(path: Path) -> Path:
+    """Absolute path through links as they are named: photographs lie beside a link to a model, not beside what it leads to."""
+    return Path(os.path.abspath(path))  # noqa: PTH100
+
+
 def _place(folder: Path, path: Path) -> str:
     inner, outer = folder.resolve(), path.resolve()
     return str(inner.relative_to(outer)) if inner.is_relative_to(outer) else str(inner)
@@ -107,7 +114,7 @@ def _holds_model(folder: Path) -> bool:
 
 def _is_given(model: Model, given: Path) -> bool:
     """Whether a model's photographs are those that were asked for by their folder."""
-    return model.images is not None and is_image_folder(given) and model.images.resolve() == given
+    return model.images is not None and is_image_folder(given) and _absolute(model.images) == given
 
 
 def _read(folder: Path, given: Path) -> Model:
@@ -139,7 +146,7 @@ def _present(folder: Path, names: Sequence[str]) -> int:
 
 def parents_in_workspace(model: Path) -> list[Path]:
     """A model's folder, and those above it up to the one that holds ``sparse`` or ``colmap/sparse``."""
-    base = model.resolve()
+    base = _absolute(model)
     bases = [base]
     for convention in (str.isdecimal, "sparse".__eq__, "colmap".__eq__):
         if convention(base.name):

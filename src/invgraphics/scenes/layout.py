@@ -14,7 +14,7 @@ from torch import Tensor
 from invgraphics.core import Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
-from invgraphics.scenes.border import background_of
+from invgraphics.scenes.border import background_of, masking_blank
 from invgraphics.scenes.pictures.images import Photo, file_exists, match_sizes
 from invgraphics.scenes.pictures.masks import masks_note
 from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
@@ -99,13 +99,24 @@ def scene_name(path: Path) -> str:
 
 
 def every_eighth(photos: Sequence[Photo]) -> Split:
-    """Split photographs in name order: every eighth is a test view, the others train (LLFF)."""
+    """Split photographs in name order: every eighth is a test view, the others train (LLFF).
+
+    Those with the very pose of a test view, as at the end of a full turn, are left out.
+
+    Raises:
+        InputError: none is left to fit.
+    """
     ordered = sorted(photos, key=lambda photo: photo.name)
     test = ordered[::HOLD_OUT]
-    train = [photo for index, photo in enumerate(ordered) if index % HOLD_OUT]
-    if not train:
+    others = [photo for index, photo in enumerate(ordered) if index % HOLD_OUT]
+    if not others:
         raise InputError(f"{len(ordered)} photograph is too few: at least one to fit and one to score are needed.")
-    return Split(train, test, rule=f"every {HOLD_OUT}th photograph by name")
+    scored = torch.stack([photo.camera.cam_to_world for photo in test])
+    train = [photo for photo in others if not bool((scored == photo.camera.cam_to_world).all(dim=(1, 2)).any())]
+    if not train:
+        raise InputError("All photographs have the poses of those to be scored.", "Poses of the photographs are needed.")
+    left = f"; {len(others) - len(train)} with the pose of one of them are left out" if len(train) < len(others) else ""
+    return Split(train, test, rule=f"every {HOLD_OUT}th photograph by name{left}")
 
 
 def evenly(items: Sequence[T], count: int | None) -> list[T]:
@@ -148,6 +159,9 @@ def compose(name: str, split: Split, frame: LocalFrame, options: SceneOptions, n
     }
     photos = match_sizes(chosen.photos)
     views = _read(photos, torch.linalg.inv(frame.world_from_local), options.size)
+    if frame.bounds.space == "contracted":
+        views, blank = masking_blank(views)
+        notes |= blank
     lenses = sorted({photo.lens.model for photo in photos if photo.lens is not None})
     if lenses:
         notes["undistortion"] = f"{', '.join(lenses)} removed at full size (bilinear), zoomed in until no pixel is blank"

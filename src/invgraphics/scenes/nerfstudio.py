@@ -59,7 +59,7 @@ def _known_points(frames: Frames) -> tuple[Points | None, dict[str, str]]:
 
 
 def _own_split(frames: Frames, listed: Sequence[Photo], photos: Sequence[Photo]) -> Split | None:
-    """The split that the file states; ``None`` where it states none. Without a list of test views, those of ``val`` are it.
+    """The split that the file states; ``None`` where it names none to score. Without a list of test views, ``val`` is it.
 
     Args:
         frames: the file.
@@ -74,6 +74,8 @@ def _own_split(frames: Frames, listed: Sequence[Photo], photos: Sequence[Photo])
         return None
     train, val, test = (names.get(key, set[str]()) for key in _LISTS)
     scored, val = (test, val) if test else (val, set[str]())
+    if not scored:
+        return None
     if "train_filenames" not in names:
         train = {photo.name for photo in listed} - scored - val
     if both := sorted(train & scored):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -76,7 +77,7 @@ class Truth:
             bounds=_bounds(path, truth, known),
             points=points,
             mesh=_mesh(path / "mesh.ply"),
-            noise_ceiling=truth["noise_ceiling"],
+            noise_ceiling=_noise_ceiling(truth, views["train"][0].camera),
             notes=_notes(truth, views["train"][0]) | ({"points": POINTS} if points is not None else {}),
         )
 
@@ -104,6 +105,14 @@ def _class_scene(path: Path, truth: Mapping[str, Any], options: SceneOptions) ->
     notes["instances"] = f"{count['train']} to fit, {count['unseen']} unseen with {count['observed']} observed views each"
     background = scene.background if truth["background"] is None else torch.tensor(truth["background"])
     return replace(scene, name=truth["name"], background=background, noise_ceiling=truth["noise_ceiling"], notes=notes)
+
+
+def _noise_ceiling(truth: Mapping[str, Any], camera: Camera) -> float | None:
+    """Noise level of pictures of a camera's size: noise of rendered pixels is independent, so that averages have less."""
+    rendered = truth["cameras"]["train"][0]
+    if truth["noise_ceiling"] is None:
+        return None
+    return truth["noise_ceiling"] + 10 * math.log10(rendered["width"] * rendered["height"] / (camera.width * camera.height))
 
 
 def _view(path: Path, split: str, index: int, table: Mapping[str, Any], options: SceneOptions) -> View:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -43,8 +44,7 @@ def validate(scene: Scene) -> Scene:
             poses(torch.stack([view.camera.cam_to_world for view in views]), names.__getitem__)
         for view, name in zip(views, names, strict=True):
             _validate_view(view, name, scene.colour)
-    if not any(view.mask is None or bool(view.mask.any()) for view in scene.train):
-        raise InputError(f"The masks of '{scene.name}' leave no pixel of any training view.", "True marks valid pixels.")
+    scene = _without_blank_views(scene)
     check_scene(scene)
     if off := [view.name for view in scene.train if principal_point_far_outside(view.camera)]:
         message = f"'{off[0]}' has its principal point far outside the picture: a crop, or resized without its calibration?"
@@ -52,6 +52,27 @@ def validate(scene: Scene) -> Scene:
     for split in ("train", "observed"):
         _check_apart(scene, split)
     return _with_val_apart(scene)
+
+
+def _without_blank_views(scene: Scene) -> Scene:
+    """Leave out views to fit, monitor and score of which masks leave no pixel, as they may once a picture is small.
+
+    Raises:
+        InputError: none is left to fit, or to score.
+    """
+    kept, blank = {}, []
+    for split, what in (("train", "training"), ("val", ""), ("test", "test")):
+        views = getattr(scene, split)
+        valid = [view.mask is None or bool(view.mask.any()) for view in views]
+        kept[split] = tuple(itertools.compress(views, valid))
+        blank += [view.name for view, one in zip(views, valid, strict=True) if not one]
+        if what and not kept[split]:
+            raise InputError(f"The masks of '{scene.name}' leave no pixel of any {what} view.", "True marks valid pixels.")
+    if not blank:
+        return scene
+    shown = ", ".join(blank[:5]) + (", ..." if len(blank) > 5 else "")
+    note = {"masked_views": f"{len(blank)} without a valid pixel are left out: {shown}"}
+    return replace(scene, **kept, notes=scene.notes | note)
 
 
 def _with_val_apart(scene: Scene) -> Scene:

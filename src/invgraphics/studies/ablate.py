@@ -17,7 +17,7 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.executors.base import Executor, Outcome, Resources
-from invgraphics.experiments.identity import run_digest, truth_digest
+from invgraphics.experiments.identity import check_replaceable, run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import Reporter
 from invgraphics.experiments.renderings import check_variants, is_kept, renderings_complete
@@ -97,6 +97,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
             if states[name].status == "missing" and _is_finished(planned, truths[_truth_key(planned)], threads):
                 states[name] = CellState("done")
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
+        _check_threads(missing, threads)
         costs = _try_methods(missing, trials)
         missing.sort(key=lambda planned: _execution_order(planned, study, costs))
         expected = {planned.id: costs[_cost_key(planned)].seconds(planned.job.budget) for planned in missing}
@@ -173,6 +174,21 @@ def _is_finished(planned: Planned, truth: str, threads: int) -> bool:
     run = planned.job.folder
     same = run.finished and run.identity == run_digest(planned.job, truth, threads)
     return same and renderings_complete(planned.job)
+
+
+def _check_threads(missing: Sequence[Planned], threads: int) -> None:
+    """Refuse to replace finished fits by fits with another number of threads.
+
+    Raises:
+        InputError: names the first.
+    """
+    for planned in missing:
+        if planned.job.folder.finished:
+            try:
+                check_replaceable(planned.job, threads)
+            except InputError as error:
+                remedy = "Give the same --jobs, add --keep to keep what is finished, or choose another --out."
+                raise InputError(error.sentence, remedy) from error
 
 
 def _try_methods(missing: Sequence[Planned], trials: Trials) -> dict[tuple[str, str, Size], Cost]:

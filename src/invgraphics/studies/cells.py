@@ -13,6 +13,7 @@ from invgraphics.experiments.identity import cell_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import AblateRequest, FitRequest
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs.folder import RUNS
 from invgraphics.scenes.open import is_rendered
 from invgraphics.studies.factors import BUDGET, SIZE, in_scope, path_of
 from invgraphics.studies.study import Cell, Study
@@ -64,6 +65,7 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
         InputError: unknown method, key, protocol or device, or a level that does not fit; the sentence names the cell.
     """
     methods: dict[tuple[Any, ...], Method] = {}
+    made = {path.name.rpartition("-")[2]: path.name for path in sorted((Path(request.out) / RUNS).glob("*-*"))}
     folders: dict[str, Path] = {}  # a run that several cells share is named after the first
     plan = []
     for cell in study.expand():
@@ -76,7 +78,9 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
             raise _in_cell(cell, error) from error
         methods[key] = job.method
         definition = cell_digest(job)
-        folder = folders.setdefault(definition, Path(fit.out) / "runs" / f"{_readable(cell)}-{definition[:10]}")
+        short = definition[:10]
+        # The readable part differs where factors were added or reordered; the fit does not.
+        folder = folders.setdefault(definition, Path(fit.out) / RUNS / made.get(short, f"{_readable(cell)}-{short}"))
         plan.append(Planned(cell, replace(job, request=replace(fit, out=str(folder)))))
     return plan
 

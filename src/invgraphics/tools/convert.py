@@ -15,7 +15,6 @@ from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate, score_model
 from invgraphics.experiments.fitted import Fitted, open_fitted
-from invgraphics.experiments.identity import check_truth
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.request import DATA, FitRequest
@@ -109,7 +108,6 @@ def convert_run(request: ConvertRequest) -> Converted:
         NumericalError: the refit left the finite numbers.
     """
     fitted = open_fitted(request.run, request.scene)
-    check_truth(fitted.folder, fitted.scene, request.scene)
     if fitted.poses is not None:
         sentence = f"{request.run} has refined its cameras' poses, which a converted run would not know."
         raise InputError(sentence, "Convert a run that was fitted without --optimise poses.")
@@ -153,6 +151,7 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
         if type(field) is not type(usual):
             sentence = f"--method {request.method} has another field than --to {request.to} makes."
             raise InputError(sentence, f"Expected {target.method}, or a recipe with the same type of field.")
+        _check_hooks(request, target)
     data = tuple(f"{DATA}{key}={inline_toml(value)}" for key, value in provenance.data.items())
     return Job.of(
         FitRequest(
@@ -169,6 +168,20 @@ def _job(request: ConvertRequest, fitted: Fitted) -> Job:
             kernels=request.kernels,
         )
     )
+
+
+def _check_hooks(request: ConvertRequest, target: Target) -> None:
+    """Refuse a method that relies on a hook which a conversion's refit is without.
+
+    Raises:
+        InputError: names the hook.
+    """
+    hooks, usual = (
+        {hook["type"] for hook in load_method(name).table.get("hooks", ())} for name in (request.method, target.method)
+    )
+    if request.to == "gaussians" and (own := sorted(hooks - usual)):
+        sentence = f"--method {request.method} relies on its hook '{own[0]}', which converted Gaussians are refitted without."
+        raise InputError(sentence, f"Convert to {target.method}, and start a fit from that: --set field.init=field.")
 
 
 def _check_empty(folder: RunFolder) -> None:

@@ -57,8 +57,17 @@ class PhotoRequest:
     def __post_init__(self) -> None:
         if self.out.suffix != ".png":
             raise InputError(f"--out cannot be '{self.out}'.", "Expected a file name that ends in .png.")
+        if self.photo.resolve() == self.out.resolve():
+            raise InputError(f"--out cannot be '{self.out}': the photograph would be overwritten.", "Choose another --out.")
+        if self.code.exists() and not self.out.exists():
+            raise InputError(f"--out cannot be '{self.out}': '{self.code}', beside it, exists.", "Choose another --out.")
         if not -90 < self.elevation < 90:
             raise InputError(f"--elevation cannot be {self.elevation:g}.", "Expected degrees between -90 and 90.")
+
+    @property
+    def code(self) -> Path:
+        """File of the inferred code."""
+        return self.out.with_suffix(".npz")
 
 
 def infer_photo(request: PhotoRequest) -> float:
@@ -82,7 +91,7 @@ def infer_photo(request: PhotoRequest) -> float:
         (code,) = infer_codes(model, scene, [[photo]], CodeInference(steps=request.steps))
         inferred = replace(model, field=model.field.at(code))
         _draw(request.out, scene, photo, [inferred.render(one) for one in (camera, *_around(camera, scene))])
-        write_arrays(request.out.with_suffix(".npz"), {"code": code.cpu().numpy()})
+        write_arrays(request.code, {"code": code.cpu().numpy()})
     return -10 * math.log10(max(photometric_error(inferred, photo, scene), 1e-10))
 
 

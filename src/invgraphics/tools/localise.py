@@ -17,7 +17,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.evaluate import display
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.posed import transform_camera, world_to_fit
-from invgraphics.experiments.progress import Reporter
+from invgraphics.experiments.progress import Reporter, warn
 from invgraphics.files import write_picture
 from invgraphics.metrics.poses import Similarity, rotation_angle
 from invgraphics.runs.folder import output_file
@@ -69,6 +69,13 @@ class LocateRequest:
             raise InputError("--starts and --steps must be at least 1.")
         if self.fov is not None and not 1 <= self.fov <= 170:
             raise InputError(f"--fov cannot be {self.fov:g}.", "Expected the horizontal field of view in degrees, 1 to 170.")
+        if self.photo.resolve() in (self.out.resolve(), self.pictures.resolve()):
+            raise InputError(f"--out cannot be '{self.out}': the photograph would be overwritten.", "Choose another --out.")
+
+    @property
+    def pictures(self) -> Path:
+        """File of the pictures that compare the photograph with the start and the result."""
+        return self.out.with_suffix(".png")
 
 
 def locate(request: LocateRequest) -> Location:
@@ -90,6 +97,8 @@ def _locate(request: LocateRequest, pixels: UInt8[np.ndarray, "h w c"], fitted: 
     drift = Similarity(1.0, torch.eye(3).double(), torch.zeros(3).double())
     if fitted.poses is not None:
         drift = world_to_fit(fitted.poses, fitted.scene)
+    if request.fov is None and "undistortion" in fitted.scene.notes:
+        warn("The scene's photographs were straightened; this one is taken as it is, as if by the lens of theirs.")
     photo = _photo(pixels, request, fitted.scene)
     starts = [replace(photo, camera=photo.camera.moved(pose)) for pose in _starts(request, fitted.scene)]
     with Reporter(f"locate {request.photo.name}") as reporter:
@@ -187,7 +196,7 @@ def _location_record(request: LocateRequest, fitted: Fitted, found: View, tried:
         error=error,
     )
     record.write(request.out)
-    _draw(request.out.with_suffix(".png"), fitted, found)
+    _draw(request.pictures, fitted, found)
     return record
 
 

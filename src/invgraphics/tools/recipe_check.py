@@ -52,7 +52,7 @@ class RecipeCheck:
 def check_recipes(folder: Path) -> RecipeCheck:
     """Compare the recipe of every run below ``folder`` with today's under the same preset, overrides and budget.
 
-    Imported and converted runs do not count: their recipes are parts of other files and runs.
+    Imported and converted runs and renderings do not count: their recipes are parts of other files and runs.
 
     Raises:
         InputError: there is no such folder, or a record is broken.
@@ -60,7 +60,8 @@ def check_recipes(folder: Path) -> RecipeCheck:
     if not folder.is_dir():
         raise InputError(f"'{folder}' is no folder.", "Give the folder of a report.")
     found = [RunFolder(path.parent).read(Provenance) for path in sorted(folder.rglob(Provenance.FILE))]
-    records = [one for one in found if one.imported is None and one.converted is None]  # others are of no recipe alone
+    # Others are of no recipe alone, or show the field of a fit that is checked itself.
+    records = [one for one in found if one.imported is None and one.converted is None and one.fitted_run is None]
     stale: dict[str, str] = {}
     seen: dict[tuple[str, ...], str | None] = {}
     for record in records:

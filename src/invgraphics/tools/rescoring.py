@@ -10,7 +10,7 @@ from pathlib import Path
 from invgraphics.files import write_text, writing_text
 from invgraphics.metrics.conventions import PROTOCOLS, Colour, Protocol
 from invgraphics.runs.folder import RunFolder, output_folder
-from invgraphics.runs.scores import Score, Scores
+from invgraphics.runs.scores import DEFAULT, Score, Scores
 from invgraphics.tools.predictions import PictureSet
 
 COLUMNS = {"psnr": ("PSNR (dB)", 3), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4), "lpips_vgg": ("LPIPS (VGG)", 4)}
@@ -52,7 +52,7 @@ def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
     """Write a scores file for each protocol under which something was scored; returns their paths.
 
     They go into the run itself; or into ``out``, which other tools' folders need, since nothing is written into them. Scores
-    that `evaluate` made from the model are never replaced.
+    that `evaluate` made from the model are never replaced, and a run that was interrupted before it had any stays unfinished.
     """
     pictures = rescored.pictures
     if out is None and not pictures.provenance:
@@ -63,6 +63,8 @@ def write_scores(rescored: Rescored, out: Path | None) -> list[Path]:
         for protocol, scores in rescored.scores.items():
             if not scores.quality or (out is None and has_model_scores(pictures, protocol)):
                 continue
+            if out is None and protocol == DEFAULT and not RunFolder(folder).finished:
+                continue  # they would mark the run as finished
             written.append(folder / scores.file)
             scores.write(written[-1])
     return written

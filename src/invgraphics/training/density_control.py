@@ -11,13 +11,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from typing_extensions import override
 
+from invgraphics.core import Field, RayRenderer, Renderer
 from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.errors import InputError
 from invgraphics.training.gaussians import GAUSSIANS, GaussianParameters, cap_at
 from invgraphics.training.hooks import FitState, Hook
 from invgraphics.training.rows import replace_rows
 
 LARGEST_OPACITY = 1 - 1e-6
 """Opacity to which a reset of a strongly filtered Gaussian is limited."""
+STATISTICS = "gradient_sum", "clone_gradient_sum", "views", "max_radius"
+"""What is gathered of each Gaussian between two rounds."""
 WHITE_RESET_STEP = 500
 """Step of 3DGS's reset against a white background; Gaussians that are reset much sooner do not become opaque again."""
 
@@ -144,6 +148,11 @@ class DensityControl(Hook):
         self.last_round: GrowthRound | None = None
 
     @override
+    def check_fit(self, field: Field, renderer: Renderer) -> None:
+        if isinstance(renderer, RayRenderer):
+            raise InputError(f"The hook '{self.name}' needs a renderer that splats.", "Gaussians of any grow by 'relocation'.")
+
+    @override
     def before_step(self, state: FitState) -> None:
         """Reset opacities, where that became due in the step before."""
         if self._reset_pending:
@@ -179,20 +188,19 @@ class DensityControl(Hook):
             self._grow_and_prune(state)
         if self._resets_due < len(config.resets) and progress >= config.resets[self._resets_due]:
             self._resets_due += 1
-            if config.stop > 0 and state.step + 1 - self._last_reset >= config.reset_spacing:
+            if progress < config.stop and state.step + 1 - self._last_reset >= config.reset_spacing:
                 self._last_reset, self._reset_pending = state.step + 1, True
         self._reset_pending |= starts and self._resets_at_start(state)
 
     def _due_to_start(self, state: FitState) -> bool:
         """Whether growth may begin: by progress, or by steps in long budgets."""
-        latest = self._config.latest_start_step
-        return state.ctx.progress >= self._config.start or (0 < latest <= state.step)
+        return state.ctx.progress >= self._config.start or 0 < self._config.latest_start_step <= state.step
 
     def _resets_at_start(self, state: FitState) -> bool:
         """Whether opacities are reset as growth begins: against a white background, unless that is too early to recover."""
         soonest = min(self._config.reset_spacing, WHITE_RESET_STEP)
-        white = self._config.white_reset and self._config.stop > 0 and bool((state.scene.background >= 1).all())
-        return white and state.step + 1 >= soonest
+        due = self._config.white_reset and state.ctx.progress < self._config.stop and state.step + 1 >= soonest
+        return due and bool((state.scene.background >= 1).all())
 
     @torch.no_grad()
     def _reset_opacities(self, state: FitState) -> None:
@@ -229,18 +237,14 @@ class DensityControl(Hook):
 
     def _cap(self, progress: float, count: int) -> int:
         """Most Gaussians at this point of the fit."""
-        config = self._config
         self._first_count = self._first_count or count
-        return cap_at(self._first_count, config.max_primitives, progress - self._started, config.cap_ramp)
+        return cap_at(self._first_count, self._config.max_primitives, progress - self._started, self._config.cap_ramp)
 
     def _to_grow(self, gradient: Float[Tensor, " n"], room: int) -> Bool[Tensor, " n"]:
         """Gaussians whose gradient is above the threshold; at most ``room`` of them, the largest gradients first."""
         grows = gradient > self._config.threshold
         if int(grows.sum()) > max(room, 0):
-            ranked = torch.argsort(gradient, descending=True, stable=True)
-            grows = torch.zeros_like(grows)
-            grows[ranked[: max(room, 0)]] = True
-            grows &= gradient > self._config.threshold
+            grows[torch.argsort(gradient, descending=True, stable=True)[max(room, 0) :]] = False
         return grows
 
     def _to_prune(self, field: GaussianParameters, largest: Float[Tensor, " n"], extent: float) -> Bool[Tensor, " n"]:
@@ -272,16 +276,12 @@ class DensityControl(Hook):
         self._clear_statistics(len(rows), new["means"])
 
     def _clear_statistics(self, count: int, like: Tensor) -> None:
-        zeros = [torch.zeros(count, device=like.device) for _ in range(4)]
+        zeros = [torch.zeros(count, device=like.device) for _ in STATISTICS]
         self._gradient_sum, self._clone_gradient_sum, self._views, self._max_radius = zeros
 
     @override
     def state_dict(self) -> dict[str, Tensor]:
-        return {
-            "gradient_sum": self._gradient_sum,
-            "clone_gradient_sum": self._clone_gradient_sum,
-            "views": self._views,
-            "max_radius": self._max_radius,
+        return {name: getattr(self, f"_{name}") for name in STATISTICS} | {
             "resets_due": torch.tensor(self._resets_due),
             "last_reset": torch.tensor(self._last_reset),
             "reset_pending": torch.tensor(self._reset_pending),

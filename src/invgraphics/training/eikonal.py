@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.core import Batch, Context, Field, Quantity, Renderer, Rendering, Samples, Trace
+from invgraphics.core import Batch, Bounds, Context, Field, Quantity, Renderer, Rendering, Samples, Trace
 from invgraphics.errors import InputError
 from invgraphics.training.requirement import Requirement
 
@@ -19,7 +19,7 @@ DISTANCE = Requirement("a signed distance", quantities=Quantity.SDF | Quantity.G
 
 @dataclass(frozen=True)
 class EikonalPenalty:
-    """Mean of (|∇f| - 1)² at random points of the bounds' box and at points near the surface.
+    """Mean of (|∇f| - 1)² at random points of the bounds' box and at points near the surface, see `eikonal_mean`.
 
     A point near the surface is the foot of a random one, x - f ∇f / |∇f|², moved at random: VolSDF takes a uniform point
     and the sample next to the surface of every ray, which a penalty, without rays, does not have.
@@ -58,8 +58,8 @@ class EikonalPenalty:
             feet = near_surface(position[kept], values.sdf[kept], gradient[kept], self.spread, ctx)
             near = field.query(Samples.at(feet), Quantity.GRADIENT).gradient
             assert near is not None
-            gradient = torch.cat([gradient, near])
-        return self.weight * eikonal_residual(gradient).mean()
+            gradient, position = torch.cat([gradient, near]), torch.cat([position, feet])
+        return self.weight * eikonal_mean(gradient, position, ctx.bounds)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class CurvaturePenalty:
 
 @dataclass(frozen=True)
 class EikonalLoss:
-    """Mean of (|∇f| - 1)² at the samples of a step, for renderers that query the gradient there anyway (NeuS).
+    """Mean of (|∇f| - 1)² at a step's samples, for renderers that query the gradient there anyway (NeuS); see `eikonal_mean`.
 
     Attributes:
         weight: factor (NeuS: 0.1).
@@ -127,7 +127,21 @@ class EikonalLoss:
                 "The loss 'eikonal' needs samples with gradients of a signed distance, which this renderer does not take.",
                 "The penalty 'eikonal' takes points of its own.",
             )
-        return self.weight * eikonal_residual(gradient).sum() / max(len(gradient), 1)
+        assert trace.samples is not None
+        return self.weight * eikonal_mean(gradient, trace.samples.position, ctx.bounds)
+
+
+def eikonal_mean(gradient: Float[Tensor, "m 3"], position: Float[Tensor, "m 3"], bounds: Bounds) -> Float[Tensor, ""]:
+    """Mean of (|∇f| - 1)²; 0 of no points. In contracted space those of the unit ball count.
+
+    Beyond it lengths are contracted, and so is what a network shows of a distance: a slope of 1 per local length would be one
+    of up to |x|² in its coordinates.
+    """
+    residual = eikonal_residual(gradient)
+    if bounds.space == "box":
+        return residual.sum() / max(len(gradient), 1)
+    within = bounds.radial_scale(position) == 1
+    return (residual * within).sum() / within.sum().clamp_min(1)
 
 
 def eikonal_residual(gradient: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:

@@ -70,7 +70,11 @@ class CroppedGaussians(Field):
 
 def crop_obstacle(renderer: Renderer) -> str:
     """Why images of a renderer cannot be cropped, as a sentence; empty if they can."""
-    if Quantity.GAUSSIANS in renderer.requires or isinstance(renderer, RayRenderer):
+    if Quantity.GAUSSIANS in renderer.requires:
+        return ""
+    if isinstance(renderer, RayRenderer):
+        if Quantity.FEATURES in renderer.requires:
+            return f"{type(renderer).__name__} cannot be cropped: it has learnt from rays through all of the scene's box."
         return ""
     return f"{type(renderer).__name__} cannot be cropped: it renders {renderer.requires.words()}, neither Gaussians nor rays."
 

@@ -16,6 +16,7 @@ from invgraphics.report.data.studies import Study
 from invgraphics.report.wording import COSTS
 from invgraphics.runs.run import Run
 from invgraphics.runs.scores import COST_UNITS
+from invgraphics.text import slug
 
 Kind = Literal["text", "int", "float", "bool"]
 
@@ -72,8 +73,8 @@ def write_table(columns: Columns, rows: Sequence[Row], stem: Path) -> None:
         parquet.write_table(table, temporary)
 
 
-def write_comparison_table(comparison: Comparison, stem: Path, base: Path) -> None:
-    """One row per method, seed and metric; runs are named by their path from ``base``.
+def write_comparison_table(comparison: Comparison, stem: Path, base: Path | None) -> None:
+    """One row per method, seed and metric; runs are named by their path from ``base``, or by method and seed without one.
 
     ``status`` is ``ok``, ``skipped`` (the note says why), ``failed`` (the note is the error) or ``baseline``.
     """
@@ -81,7 +82,8 @@ def write_comparison_table(comparison: Comparison, stem: Path, base: Path) -> No
     for method in comparison.methods:
         for run in comparison.runs_of(method):
             common: Row = {"scene": comparison.scene, "method": run.method, "seed": run.seed, "views": len(run.scores.views)}
-            common |= {"protocol": run.scores.protocol, "run": relative(run.folder, base)}
+            place = f"{slug(run.method)}-seed-{run.seed}" if base is None else relative(run.folder, base)
+            common |= {"protocol": run.scores.protocol, "run": place}
             rows += [common | row for row in (*_mean_rows(run), *_skipped_rows(run), *_cost_rows(run))]
         for failure in comparison.failures_of(method):
             row = {"scene": comparison.scene, "method": method, "seed": failure.seed, "status": "failed", "note": failure.error}

@@ -38,7 +38,7 @@ MANY = 20
 """Number of photographs from which on a triangulation is announced: 60 of 200 px take a minute and a half of two busy cores."""
 SCHEMA = 2
 """Rises where the same photographs give other points, or more is known of them."""
-DATABASE, PHOTOS, PAIRS = "features.db", "photos", "pairs.txt"
+DATABASE, PHOTOS, MASKS, PAIRS = "features.db", "photos", "masks", "pairs.txt"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +76,8 @@ def triangulated(scene: Scene) -> Triangulated:
     for view in scene.train:
         for values in (view.camera.cam_to_world, view.camera.focal, view.camera.principal_point):
             sha.update(values.detach().cpu().double().numpy().tobytes())
+        if view.mask is not None:
+            sha.update(view.mask.cpu().numpy().tobytes())
     try:
         folder = cache.root().parent / "points"
         folder.mkdir(exist_ok=True)
@@ -124,7 +126,8 @@ def triangulate(scene: Scene, seed: int = 0) -> Triangulated:
     """Triangulate SfM points from the training photographs at their known poses (Schönberger & Frahm 2016, §4.3).
 
     Args:
-        scene: with its training views; transparent photographs are put in front of the scene's background.
+        scene: with its training views; transparent photographs are put in front of the scene's background, and nothing is found
+            where a mask is false.
         seed: of RANSAC.
 
     Returns:
@@ -194,15 +197,21 @@ def _posed(views: Sequence[View], names: Sequence[str], folder: Path) -> Any:
         rigid = pycolmap.Rigid3d(pose[:3])
         reconstruction.add_image_with_trivial_frame(pycolmap.Image(name, [], image.camera_id, image.image_id), rigid)
         assert image.image_id == number, "photographs are numbered in their order"
-    pycolmap.extract_features(
-        folder / DATABASE,
-        folder / PHOTOS,
-        list(names),
-        pycolmap.CameraMode.PER_IMAGE,
-        pycolmap.ImageReaderOptions(),
-        extraction,
-    )
+    reader = pycolmap.ImageReaderOptions()
+    if any(view.mask is not None for view in views):
+        _write_masks(views, names, folder / MASKS)
+        reader.mask_path = str(folder / MASKS)
+    mode = pycolmap.CameraMode.PER_IMAGE
+    pycolmap.extract_features(folder / DATABASE, folder / PHOTOS, list(names), mode, reader, extraction)
     return reconstruction
+
+
+def _write_masks(views: Sequence[View], names: Sequence[str], folder: Path) -> None:
+    """Write a mask for each photograph, as COLMAP names them: white where features may be found."""
+    folder.mkdir()
+    for view, name in zip(views, names, strict=True):
+        valid = torch.ones(view.image.shape[:2], dtype=torch.bool) if view.mask is None else view.mask.cpu()
+        Image.fromarray(valid.numpy().astype(np.uint8) * 255).save(folder / f"{name}.png")
 
 
 def _match(folder: Path, seed: int) -> None:
