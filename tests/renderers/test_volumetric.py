@@ -10,6 +10,7 @@ from invgraphics.core import Bounds, Camera, Context, Field, FieldValues, Quanti
 from invgraphics.core.transforms import se3_exp
 from invgraphics.fields.analytic import GaussianBlob, Slab, Sphere
 from invgraphics.renderers.occupancy import OccupancyConfig
+from invgraphics.renderers.proposals import ProposalsConfig
 from invgraphics.renderers.samplers import HierarchicalConfig, StratifiedConfig
 from invgraphics.renderers.volumetric import Volumetric, VolumetricConfig, query
 
@@ -178,6 +179,26 @@ def test_updates_reach_the_sampler(make_scene: Callable[..., Scene]) -> None:
     make.update(Sphere(50.0, 0.3), Context(scene.bounds, training=True))
     assert not make.sampler.occupied.all()  # type: ignore[union-attr]
     assert {"sampler.ema", "sampler.occupied", "sampler.step"} == set(make.state_dict())
+
+
+@pytest.mark.parametrize(("space", "reach", "scale"), [("contracted", 1.0, 0.5**2), ("box", 2.0, (0.5 / 3.0) ** 2)])
+def test_near_samples_of_a_trained_level_pull_less_too(
+    make_scene: Callable[..., Scene], space: str, reach: float, scale: float
+) -> None:
+    """Mip-NeRF's coarse level, which has a loss of its own: else it would fit what the other one keeps off."""
+    rays = Rays.make(torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64))
+    pulls = []
+    for used in (0.0, reach):
+        field = Slab(20.0, 0.495, 0.505, colour=(0.2, 0.5, 0.8)).double()
+        field.colour = torch.nn.Parameter(field.colour.detach().clone())
+        sampler = ProposalsConfig(counts=(4000,), count=4, train_levels=True)
+        model = VolumetricConfig(sampler, gradient_reach=used).build(make_scene(space))
+        _, trace = model.render_rays(field, rays, Context(box(space), training=True))
+        (level,) = trace.levels
+        assert level.values is not None and level.weights is not None and level.values.radiance is not None
+        shown = (level.weights[:, None] * level.values.radiance).sum()
+        pulls.append(torch.autograd.grad(shown, field.colour)[0])
+    torch.testing.assert_close(pulls[1] / pulls[0], torch.full((3,), scale, dtype=F64), rtol=0.1, atol=0)
 
 
 @pytest.mark.parametrize(

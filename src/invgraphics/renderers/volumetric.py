@@ -101,6 +101,7 @@ class Volumetric(RayRenderer):
         assert values.density is not None
         if self.gradient_reach > 0 and torch.is_grad_enabled():
             values = _scale_near_gradients(values, samples, rays, ctx.bounds, self.gradient_reach)
+            levels = tuple(_scale_level(level, rays, ctx.bounds, self.gradient_reach) for level in levels)
             assert values.density is not None
         return integrate(rays, samples, values, values.density * samples.delta, levels)
 
@@ -142,6 +143,18 @@ def _scale_near_gradients(values: FieldValues, samples: Samples, rays: Rays, bou
         return values
     scale = _gradient_scale(samples, reach * float(bounds.half.max()))
     return _scale_gradients(values, scale.where(within[samples.ray], 1.0))
+
+
+def _scale_level(level: Trace, rays: Rays, bounds: Bounds, reach: float) -> Trace:
+    """Scale the gradients of a level that is trained by colours of its own, as mip-NeRF's coarse one."""
+    samples, values = level.samples, level.values
+    if samples is None or values is None or values.density is None or values.radiance is None:
+        return level
+    scaled = _scale_near_gradients(values, samples, rays, bounds, reach)
+    assert scaled.density is not None
+    if scaled is values:
+        return level
+    return replace(level, values=scaled, weights=sample_weights(scaled.density, samples, len(rays)))
 
 
 def _gradient_scale(samples: Samples, reach: float) -> Float[Tensor, " m"]:
