@@ -1,5 +1,6 @@
 """Neural fields: gradients and normals by finite differences, chunks, edges of the region, and the published sizes."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
+from invgraphics.fields.starting_sphere import hollow_radius
 from invgraphics.testing import toy_scene
 
 D, S, G, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.GRADIENT, Quantity.RADIANCE, Quantity.NORMAL
@@ -242,19 +244,25 @@ SPHERES = [
 
 
 @pytest.mark.parametrize(("encoding", "layers", "skip"), SPHERES)
-@pytest.mark.parametrize(("space", "interior"), [("box", False), ("box", True), ("contracted", False)])
+@pytest.mark.parametrize(("space", "interior"), itertools.product(["box", "contracted"], [False, True]))
 def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, layers, skip, space, interior):
     """On every encoding, in a cube and in a flatter box: distances, and gradients of length 1 along the radius.
 
-    The sphere is a solid one before the cameras, and a hollow one of twice its radius around cameras in the box.
+    The sphere is a solid one before the cameras, and a hollow one of two or three times its radius around cameras in the box,
+    or in endless space around those that look away from its middle.
     """
-    sign, radius = (-1, 1.0) if interior else (1, 0.5)
+    sign, radius = (-1, 1.0 if space == "box" else 1.5) if interior else (1, 0.5)
     for flat in (1.0, 0.6):
         scene = make_scene(space)
         if space == "box" and not interior:
             away = torch.eye(4)
             away[0, 3] = 4.0
             camera = replace(scene.train[0].camera, cam_to_world=away)
+            scene = scene.with_views(train=(replace(scene.train[0], camera=camera),))
+        if space == "contracted" and interior:
+            outwards = torch.eye(4)
+            outwards[2, 3] = 0.3 * float(scene.bounds.half[2])
+            camera = replace(scene.train[0].camera, cam_to_world=outwards)
             scene = scene.with_views(train=(replace(scene.train[0], camera=camera),))
         half = scene.bounds.half * torch.tensor([1.0, 1.0, flat])
         bounds = Bounds(scene.bounds.centre - half, scene.bounds.centre + half, space)
@@ -271,6 +279,20 @@ def test_a_signed_distance_starts_as_a_sphere(make_scene, encoding, layers, skip
         cosine = sign * (values.gradient * torch.nn.functional.normalize(offset, dim=1)).sum(dim=1)[away]
         assert float((cosine - 1).abs().mean()) < 0.1
         assert float((values.gradient.norm(dim=1)[away] - 1).abs().mean()) < 0.1
+
+
+def test_the_hollow_sphere_holds_the_cameras_of_a_long_room(make_scene):
+    """Its radius is not that of the room's height, which would leave those at both ends in the solid."""
+    scene = make_scene("box")
+    poses = torch.eye(4).repeat(2, 1, 1)
+    poses[:, 0, 3] = torch.tensor([-1.5, 1.5])
+    views = tuple(replace(scene.train[0], camera=replace(scene.train[0].camera, cam_to_world=pose)) for pose in poses)
+    bounds = Bounds(torch.tensor([-2.0, -0.5, -0.5]), torch.tensor([2.0, 0.5, 0.5]))
+    scene = replace(scene, bounds=bounds).with_views(train=views)
+    assert hollow_radius(scene) == pytest.approx(1.1 * 1.5)
+    field = NeuralFieldConfig(FrequencyConfig(octaves=6), "sdf", 8, 128, 4).build(scene)
+    distance = field.query_no_grad(Samples.at(poses[:, :3, 3]), S).sdf
+    assert distance is not None and float(distance.min()) > 0
 
 
 def test_nerf_and_instant_ngp_have_their_published_sizes(make_scene):

@@ -37,11 +37,7 @@ from invgraphics.fields.fused import FieldParts, fused_parts, fused_surface, sdf
 from invgraphics.fields.geometry import chunks, query_geometry
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
-
-INITIAL_RADIUS = 0.5
-"""Radius of the sphere that a signed distance function starts as, in the box's smallest half-extent (NeuS)."""
-INTERIOR_RADIUS = 1.0
-"""The same where cameras are within the box: a hollow sphere around them (MonoSDF), as a solid one would blind them."""
+from invgraphics.fields.starting_sphere import SOLID, hollow_radius
 
 _POINTWISE = {
     "density": Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,
@@ -57,7 +53,7 @@ class NeuralFieldConfig(NeuralSettings):
 
     def build(self, scene: Scene) -> NeuralField:
         """Build the field for ``scene``'s bounds and colour space, its weights drawn from torch's global generator."""
-        return NeuralField(resolve_encodings(self, scene), scene.bounds, scene.colour, interior=scene.is_interior)
+        return NeuralField(resolve_encodings(self, scene), scene.bounds, scene.colour, hollow=hollow_radius(scene))
 
 
 class NeuralField(Field):
@@ -67,7 +63,7 @@ class NeuralField(Field):
         config: sizes and kinds.
         bounds: the region; density is zero outside it.
         colour: radiance is in [0, 1] for ``srgb``, in [0, inf) for ``linear``.
-        interior: a signed distance starts as a hollow sphere instead of a solid one.
+        hollow: radius of the hollow sphere that a signed distance starts as, local units; ``None`` for a solid one.
 
     Attributes:
         encoding: of positions, for geometry.
@@ -89,7 +85,7 @@ class NeuralField(Field):
         bounds: Bounds,
         colour: Literal["srgb", "linear"] = "srgb",
         *,
-        interior: bool = False,
+        hollow: float | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -121,8 +117,8 @@ class NeuralField(Field):
         self._needs_geometry_for_colour = width > 0 or self.appearance is None
         self._geometry_feature_width = width
         if config.geometry == "sdf":
-            radius = (INTERIOR_RADIUS if interior else INITIAL_RADIUS) * float(bounds.half.min()) / self._half
-            self.geometry_net.initialise_as_sphere(radius, inside_out=interior)
+            radius = SOLID * float(bounds.half.min()) if hollow is None else hollow
+            self.geometry_net.initialise_as_sphere(radius / self._half, inside_out=hollow is not None)
 
     @property
     def bounds(self) -> Bounds:
