@@ -178,3 +178,24 @@ def test_a_ray_that_ends_before_it_begins_shows_nothing(name: str) -> None:
         sums = gaussian_composites(moving, rays, None, 1)
     assert not bool(sums[0].any())
     assert bool(sums[1].any())
+
+
+@pytest.mark.parametrize("width", [1e-4, 3e-4, 1e-3])
+@pytest.mark.parametrize("offset", [0.0, 0.001, 0.006])
+def test_thin_gaussians_hide_each_other_before_a_distant_one(width: float, offset: float) -> None:
+    """A red sheet before a blue one, on rays that a faint Gaussian makes ten thousand times as long as their distance."""
+    means = torch.tensor([[0.0, 2.0 + offset, 0.0], [0.0, 2.005 + offset, 0.0], [0.0, 100.0, 0.0]])
+    gaussians = Gaussians(
+        means=means,
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
+        scales=torch.tensor([[0.5, width, 0.5], [0.5, width, 0.5], [50.0, 50.0, 50.0]]),
+        opacities=torch.tensor([0.95, 0.95, 0.3]),
+        sh=torch.tensor([[[1.5, -1.5, -1.5]], [[-1.5, -1.5, 1.5]], [[0.0, 0.0, 0.0]]]),
+    )
+    rays = Rays.make(torch.tensor([[0.0, 0, 0], [0.1, 0, 0.1]]), torch.tensor([[0.0, 1, 0]]).repeat(2, 1))
+    primitives = precompute(gaussians, "peak", SMALLEST)
+    fast = gaussian_integrals(primitives, rays, 32)
+    with kernels.using("reference"):
+        exact = gaussian_integrals(primitives, rays, 32)
+    assert float((exact[:, 1] / exact[:, 0]).max()) < 0.9
+    torch.testing.assert_close(fast, exact, atol=2e-3, rtol=0)

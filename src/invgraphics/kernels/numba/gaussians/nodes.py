@@ -28,16 +28,17 @@ _LOG2E = np.float32(1 / np.log(2.0))
 _HALF, _ONE, _SIXTH, _THIN = np.float32(0.5), np.float32(1.0), np.float32(1 / 6), np.float32(0.02)
 _MOST = np.float32(MAX_OPTICAL_DEPTH)
 _TINY, _EPS = np.float32(np.finfo(np.float32).tiny), np.float32(np.finfo(np.float32).eps)
-_BITS, _BUCKETS, PASSES = np.uint32(8), 256, 2
-_LAST_KEY = np.float32(65535.0)
-"""Edges are sorted in steps of this part of a ray's interval, which is far less than a node's distance from the next."""
+_BITS, _BUCKETS, PASSES = np.uint32(8), 256, 3
+_LAST_KEY = np.float32(2**24 - 1)
+"""Edges are sorted, and placed, in steps of this part of a ray's interval: float32 has no more digits. With 16 bits, steps
+would be wider than thin Gaussians in front of a distant one, which would then mix instead of hiding each other."""
 _DEEPEST = np.float32(18.0)
 """Optical depth of the staircase behind which Gaussians are not looked at: float32 has no alpha between it and 1."""
 
 
 @inlined
 def _sort(keys, rises, keys_swap, rises_swap, n, counts):
-    """Sort 16-bit keys with what belongs to them, of which ``counts`` holds the histograms; back in the first arrays."""
+    """Sort 24-bit keys with what belongs to them, of which ``counts`` holds the histograms; they end in the second arrays."""
     for p in range(PASSES):
         shift = np.uint32(_BITS * np.uint32(p))
         total = np.int32(0)
@@ -73,18 +74,19 @@ def place_nodes(t, sigma, depth, begin, end, near, far, steps, nodes, scratch, c
             key = np.uint32(min((at - near) * scale + np.float32(0.5), _LAST_KEY))
             keys[n], scratch[1, n] = key, height * _RISES[e]
             counts[0, key & np.uint32(255)] += 1
-            counts[1, key >> _BITS] += 1
+            counts[1, (key >> _BITS) & np.uint32(255)] += 1
+            counts[2, key >> (_BITS + _BITS)] += 1
             n += 1
     _sort(keys, scratch[1], swap, scratch[3], n, counts)
-    place, reached, grown = scratch[2], scratch[4], scratch[5]
+    place, rises, reached, grown = scratch[0], scratch[3], scratch[4], scratch[5]
     for i in range(n):
-        place[i] = np.float32(keys[i]) * step
+        place[i] = np.float32(swap[i]) * step
     density, total = 0.0, 0.0
     reached[0] = np.float32(0.0)
     stop = np.float32(np.inf)
     for i in range(n - 1):
         # In float64, because the density of thin Gaussians is large and must vanish behind them.
-        density += np.float64(scratch[1, i])
+        density += np.float64(rises[i])
         total += max(density, 0.0) * np.float64(place[i + 1] - place[i])
         reached[i + 1] = np.float32(total)
         if reached[i + 1] >= _DEEPEST and place[i + 1] < stop:
