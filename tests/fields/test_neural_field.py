@@ -19,7 +19,7 @@ from invgraphics.fields.encodings.triplane import TriplaneConfig
 from invgraphics.fields.encodings.voxels import VoxelsConfig
 from invgraphics.fields.mlp import Mlp, truncated_exp
 from invgraphics.fields.neural import NeuralField, NeuralFieldConfig
-from invgraphics.fields.starting_sphere import hollow_radius
+from invgraphics.fields.starting import hollow_radius
 from invgraphics.testing import toy_scene
 
 D, S, G, R, N = Quantity.DENSITY, Quantity.SDF, Quantity.GRADIENT, Quantity.RADIANCE, Quantity.NORMAL

@@ -37,7 +37,7 @@ from invgraphics.fields.fused import FieldParts, fused_parts, fused_surface, sdf
 from invgraphics.fields.geometry import chunks, query_geometry
 from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
-from invgraphics.fields.starting_sphere import SOLID, hollow_radius
+from invgraphics.fields.starting import SOLID, hollow_radius
 
 _POINTWISE = {
     "density": Quantity.DENSITY | Quantity.RADIANCE | Quantity.NORMAL | Quantity.FEATURES,

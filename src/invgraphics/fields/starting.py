@@ -1,4 +1,4 @@
-"""Initial points of Gaussians, from the scene, its depth maps or at random, and scales from nearest neighbours."""
+"""Where fits start: points and scales of Gaussians, and the spheres of signed distances, solid or hollow."""
 
 from __future__ import annotations
 
@@ -27,6 +27,12 @@ LEAST_MATCHED = 500
 """Points that stereo must find for a start from them: fewer are chance."""
 SCALE_RANGE = (1e-5, 0.5)
 """Limits of a starting scale, relative to the scene's radius (or to the distance from its centre, where that is larger)."""
+SOLID = 0.5
+"""Radius of the solid sphere that a signed distance starts as, in the box's smallest half-extent (NeuS)."""
+FARTHER = 1.1
+"""Least radius of the hollow sphere (MonoSDF) over the distance of the farthest camera."""
+ENDLESS = 1.5
+"""Radius of the hollow sphere in endless space, in half-extents of contracted space, which ends at 2."""
 
 
 def starting_scales(positions: Float[Tensor, "n 3"], bounds: Bounds) -> Float[Tensor, " n"]:
@@ -168,3 +174,17 @@ def initial_points(scene: Scene, init: str, count: int, most: int) -> Points:
         return matched
     known = init in ("scene", "stereo") and scene.points is not None
     return scene_points(scene, most) if known else random_points(scene.bounds, count)
+
+
+def hollow_radius(scene: Scene) -> float | None:
+    """Radius in local units of the hollow sphere that a signed distance starts as around a scene's cameras.
+
+    In a box at least its smallest half-extent; ``None`` for a solid sphere, which would blind cameras within.
+    """
+    if not scene.is_interior:
+        return None
+    half = float(scene.bounds.half.min())
+    if scene.bounds.space == "contracted":
+        return ENDLESS * half
+    farthest = max(float((view.camera.position - scene.bounds.centre).norm()) for view in scene.train)
+    return max(half, FARTHER * farthest)
