@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,13 +14,11 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import load_fitted
 from invgraphics.experiments.memory_check import COPIES, RAY_BYTES, TRAINED_COPIES, upsampled_bytes
 from invgraphics.experiments.progress import warn
-from invgraphics.fields.gaussian import GaussianField
 from invgraphics.fields.mesh import MeshFieldConfig
 from invgraphics.formats.mesh import mesh_from_file
 from invgraphics.memory import total_bytes
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
-from invgraphics.renderers.splatting import Splatting
 from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches, size_of
@@ -33,8 +30,6 @@ PICTURE_BYTES = 300
 """Of a pixel of a training picture: rendering, truth, SSIM's moments, and their gradients."""
 CHECKPOINT_COPIES = 3
 """A checkpoint holds each parameter and Adam's two moments."""
-DISC_THICKNESS = 1e-3
-"""Of the axis that discs drop at the start of a fit, over their width: shorter than the others will become."""
 MARGIN = 1.25
 """Memory that is freed and allocated again in other sizes leaves gaps."""
 GROWTH_MARGIN = 1.5
@@ -84,7 +79,7 @@ def check_losses(fit: Fit, method: Method) -> None:
 
 
 def initialise_field(plan: Plan, method: Method, scene_spec: str, scene: Scene) -> Plan:
-    """Initialise the plan's field: from the run that the recipe's ``field.source`` names, if any, and flat if it is of discs.
+    """Initialise the plan's field by conversion from the run that the recipe's ``field.source`` names, if any.
 
     Args:
         plan: of the fit.
@@ -99,7 +94,7 @@ def initialise_field(plan: Plan, method: Method, scene_spec: str, scene: Scene) 
     source = getattr(config, "source", "")
     check_source(method, scene_spec)
     if not source:
-        return _with_field(plan, plan.model.field)
+        return plan
     if isinstance(config, MeshFieldConfig) and Path(source).is_file():
         return _with_field(plan, config.from_mesh(mesh_from_file(Path(source), plan.scene), plan.scene))
     fitted = load_fitted(RunFolder(Path(source)), scene)
@@ -111,23 +106,7 @@ def initialise_field(plan: Plan, method: Method, scene_spec: str, scene: Scene) 
     return _with_field(plan, config.converted(source_field, plan.scene))
 
 
-@torch.no_grad()
-def flatten_discs(field: GaussianField, plan: Plan) -> None:
-    """Turn Gaussians that a fit is to show as discs into thin ones of random orientation, as 2DGS starts them; in place.
-
-    A disc is spanned by its two longest axes, and the third has no gradient: of three equal ones it would become one of the
-    longest as soon as another shrinks, and the disc would turn over.
-    """
-    renderer = plan.model.renderer
-    if isinstance(renderer, Splatting) and renderer.config.shape == "disc" and not field.isotropic:
-        torch.manual_seed(plan.seed)
-        field.quaternions.copy_(torch.randn(field.quaternions.shape))
-        field.log_scales[:, 2] += math.log(DISC_THICKNESS)
-
-
 def _with_field(plan: Plan, field: Field) -> Plan:
-    if isinstance(field, GaussianField):
-        flatten_discs(field, plan)
     return replace(plan, model=replace(plan.model, field=field.to(plan.device)))
 
 
