@@ -178,8 +178,8 @@ def initial_points(scene: Scene, init: str, count: int, most: int) -> Points:
 def hollow_radius(scene: Scene) -> float | None:
     """Radius in local units of the hollow sphere that a signed distance starts as around a scene's cameras.
 
-    In a box its smallest half-extent, also where some cameras are farther out: on `room` a sphere that holds them all ends 1.5 and
-    4.9 dB lower (64 px, 500 steps of NeuS on a hash grid, two seeds). ``None`` for a solid sphere, which would blind cameras within.
+    In a box its smallest half-extent, also where some cameras are farther out: on `room` a sphere that holds all of them ends
+    1.5 and 4.9 dB lower (64 px, 500 steps of NeuS on a hash grid, two seeds). ``None`` for a solid sphere, for other scenes.
     """
     if not scene.is_interior:
         return None
