@@ -154,6 +154,15 @@ class Conditional(Field):
         return self.codes.mean(dim=0)
 
 
+def resize_to_stored(parameter: Tensor, stored: Tensor) -> None:
+    """Resize a parameter to the shape of a stored one that is about to be loaded.
+
+    In place, so that references to the parameter (an optimiser's, for instance) stay valid.
+    """
+    parameter.data = parameter.new_empty(stored.shape)
+    parameter.grad = None
+
+
 class Encoding(nn.Module, ABC):
     """Maps positions in the unit cube to features.
 

@@ -190,7 +190,8 @@ class Scene:
             return bool(self.bounds.contains(poses[:, :3, 3]).all())
         offset = poses[:, :3, 3] - self.bounds.centre
         outwards = (offset * poses[:, :3, 2]).sum(dim=1)
-        return bool((offset.norm(dim=1) <= 1.001 * self.bounds.half.min()).all()) and float(outwards.median()) > 0
+        near = offset.norm(dim=1) <= 1.001 * self.bounds.half.min()  # the farthest camera is at 1, but for rounding
+        return bool(near.all()) and float(outwards.median()) > 0
 
     @property
     def is_class(self) -> bool:

@@ -109,7 +109,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
     device = device_of("cuda" if provenance.device.startswith("cuda") and torch.cuda.is_available() else "cpu")
     source = folder.fit(provenance)
     region = source.read(Provenance).region
-    trained = in_region(_as_sampled(scene, provenance), region)
+    trained = in_region(_with_fitted_cameras(scene, provenance), region)
     model = build_model(method, trained, provenance.seed, device, shown=provenance.fitted_run is not None)
     if provenance.fitted_run is not None:
         model = replace(model, renderer=model.renderer.untrained())
@@ -120,7 +120,7 @@ def load_fitted(folder: RunFolder, scene: Scene) -> Fitted:
         raise InputError(f"{source.checkpoint} does not fit the run's recipe.", str(error).splitlines()[-1].strip()) from error
 
 
-def _as_sampled(scene: Scene, provenance: Provenance) -> Scene:
+def _with_fitted_cameras(scene: Scene, provenance: Provenance) -> Scene:
     """The scene with the training cameras that a fit had, of which the sizes of some fields are made."""
     data = fill(TrainingData, provenance.data)
     kept = replace(data, init="random", background=KEEP, photo_noise=0.0, exposure=0.0)  # what changes no camera

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from invgraphics.core import harmonics
-from invgraphics.core.field import Field, Gaussians, Quantity
+from invgraphics.core.field import Field, Gaussians, Quantity, resize_to_stored
 from invgraphics.core.rendering import Context
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Points, Scene
@@ -257,9 +257,7 @@ class GaussianField(Field):
         for name in PARAMETERS:
             stored, parameter = state_dict.get(prefix + name), getattr(self, name)
             if isinstance(stored, Tensor) and stored.shape[1:] == parameter.shape[1:] and len(stored) != len(parameter):
-                # Resized in place, so that references to the parameter (an optimiser's, for instance) stay valid.
-                parameter.data = parameter.new_empty(stored.shape)
-                parameter.grad = None
+                resize_to_stored(parameter, stored)
         # Kept by runs that have it; others are not smoothed.
         self.smoothing = self.means.new_zeros(len(self.means))
         state_dict.setdefault(prefix + "smoothing", self.smoothing)

@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from invgraphics.core import harmonics
 from invgraphics.core.bounds import Bounds
-from invgraphics.core.field import Field, Quantity
+from invgraphics.core.field import Field, Quantity, resize_to_stored
 from invgraphics.core.mesh import Mesh
 from invgraphics.core.rendering import Context, Rendering
 from invgraphics.core.samples import FieldValues, Samples
@@ -156,9 +156,7 @@ class MeshField(Field):
         for name in (*GEOMETRY, *COLOURS):
             stored, own = state_dict.get(prefix + name), getattr(self, name)
             if isinstance(stored, Tensor) and stored.shape[1:] == own.shape[1:] and len(stored) != len(own):
-                # Resized in place, so that references to a parameter (an optimiser's, for instance) stay valid.
-                own.data = own.new_empty(stored.shape)
-                own.grad = None
+                resize_to_stored(own, stored)
         self._normals = None
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 

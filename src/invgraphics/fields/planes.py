@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from invgraphics.core import Camera, Context, Field, FieldValues, Planes, Quantity, Samples, Scene
 from invgraphics.core.compositing import layer_alphas_from_weights
+from invgraphics.core.field import resize_to_stored
 from invgraphics.core.planes import WIDEST, inverse_depths, mean_camera, widened, widest_angle
 from invgraphics.errors import InputError, NotComposableError
 from invgraphics.fields.mlp import Mlp
@@ -193,11 +194,11 @@ class PlaneField(Field):
         self.register_buffer("depths", depths.detach().clone())
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Resize to the checkpoint's texels first, whose number follows from the points that a fit had."""
         for name in ("rgb_logits", "alpha_logits", "coefficients"):
             stored, parameter = state_dict.get(prefix + name), getattr(self, name)
             if isinstance(stored, Tensor) and parameter is not None and stored.shape[0] == parameter.shape[0]:
-                # Resized in place: how many texels there are follows from the points that a fit had.
-                parameter.data = parameter.new_empty(stored.shape)
+                resize_to_stored(parameter, stored)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     @property

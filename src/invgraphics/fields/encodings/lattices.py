@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core.field import Encoding
+from invgraphics.core.field import Encoding, resize_to_stored
 from invgraphics.core.lattice import CORNER, ORIGIN, Combination, Lattice, LatticeField, resampled, vertices_along
 from invgraphics.errors import InputError
 
@@ -127,9 +127,7 @@ class LatticeFeatures(Encoding):
         for place in self._places:
             stored, parameter = state_dict.get(f"{prefix}{place.group}.{place.key}"), self._group(place)[place.key]
             if isinstance(stored, Tensor) and stored.ndim == parameter.ndim and stored.shape[-1] == parameter.shape[-1]:
-                # Resized in place, so that references to the parameter (an optimiser's, for instance) stay valid.
-                parameter.data = parameter.new_empty(stored.shape)
-                parameter.grad = None
+                resize_to_stored(parameter, stored)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from invgraphics import kernels
-from invgraphics.core.field import Encoding
+from invgraphics.core.field import Encoding, resize_to_stored
 from invgraphics.core.lattice import CORNER, ORIGIN, Combination, Lattice, resampled, vertices_along
 from invgraphics.errors import InputError
 from invgraphics.fields.encodings.lattices import CUBE, LatticeConfig
@@ -144,8 +144,6 @@ class SparseVoxels(Encoding):
             and rows.shape[-1:] == self.rows.shape[-1:]
             and links.ndim == 3
         ):
-            # Resized in place, so that references to the parameter (an optimiser's, for instance) stay valid.
-            self.rows.data = self.rows.new_empty(rows.shape)
-            self.rows.grad = None
+            resize_to_stored(self.rows, rows)
             self.links = self.links.new_empty(links.shape)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

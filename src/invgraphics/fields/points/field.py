@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from invgraphics.core import harmonics
 from invgraphics.core.bounds import Bounds
-from invgraphics.core.field import Field, Quantity
+from invgraphics.core.field import Field, Quantity, resize_to_stored
 from invgraphics.core.rendering import Context
 from invgraphics.core.samples import FieldValues, Samples
 from invgraphics.core.scene import Points, Scene
@@ -288,6 +288,5 @@ class PointField(Field):
         for name in ROWS:
             stored, own = state_dict.get(prefix + name), getattr(self, name)
             if isinstance(stored, Tensor) and stored.shape[1:] == own.shape[1:] and len(stored) != len(own):
-                own.data = own.new_empty(stored.shape)
-                own.grad = None
+                resize_to_stored(own, stored)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
