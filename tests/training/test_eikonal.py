@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from invgraphics.core import Context, Field, FieldValues, Quantity, Samples
+from invgraphics.core import Bounds, Context, Field, FieldValues, Quantity, Samples
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_plan
 from invgraphics.fields.analytic import Box, GaussianBlob, Sphere
@@ -17,7 +17,7 @@ from invgraphics.renderers.samplers import StratifiedConfig
 from invgraphics.renderers.volumetric import VolumetricConfig
 from invgraphics.testing import toy_scene
 from invgraphics.training.budget import Budget
-from invgraphics.training.eikonal import CurvaturePenalty, EikonalLoss, EikonalPenalty, foot_points, laplacian
+from invgraphics.training.eikonal import CurvaturePenalty, EikonalLoss, EikonalPenalty, eikonal_mean, foot_points, laplacian
 from invgraphics.training.fit import Fit
 
 
@@ -124,3 +124,13 @@ def test_a_field_without_a_distance_is_refused_before_anything_is_built(name: st
     plan = build_plan(resolve("mine", "", hashed), toy_scene(views=2, size=4), Budget(steps=1), 0, torch.device("cpu"))
     with pytest.raises(InputError, match=f"The penalty '{name}' needs a signed distance, which NeuralField does not have"):
         Fit(plan)
+
+
+def test_in_contracted_space_points_of_the_unit_ball_count() -> None:
+    """Beyond it a length is contracted: a slope of 1 there is none of the network's coordinates."""
+    position = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, -0.9], [3.0, 0.0, 0.0], [0.0, -1.2, 0.0]])
+    gradient = torch.tensor([[1.5, 0.0, 0.0], [0.0, 1.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
+    lo, hi = -torch.ones(3), torch.ones(3)
+    assert float(eikonal_mean(gradient, position, Bounds(lo, hi, "contracted"))) == pytest.approx(0.5**2 / 2)
+    assert float(eikonal_mean(gradient, position, Bounds(lo, hi))) == pytest.approx((0.5**2 + 8.0**2 + 3.0**2) / 4)
+    assert float(eikonal_mean(gradient[2:], position[2:], Bounds(lo, hi, "contracted"))) == 0
