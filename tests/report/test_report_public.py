@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import getpass
 import re
 import shlex
+import shutil
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +18,10 @@ from pyarrow import parquet
 
 from invgraphics.cli import main
 from invgraphics.errors import InputError
+from invgraphics.report.build import build_from_runs
 from invgraphics.report.data.redact import HIDDEN, Redactor, redactor_for
 from invgraphics.report.study import build_study_report
+from invgraphics.text import slug
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -113,6 +117,17 @@ def test_public_comparison_tells_nothing_private(
         for part in text.split(f'{attribute}="')[1:]:
             link = part.split('"')[0]
             assert link.startswith(("#", "data:")) or (out / link).is_file(), link
+
+
+def test_folders_of_runs_are_not_named(comparison_folder: Path, tmp_path: Path) -> None:
+    """They may lie in two people's homes."""
+    homes = [Path(shutil.copytree(comparison_folder, tmp_path / "home" / name / "balls")) for name in ("alice", "bob")]
+    runs = [sorted(home.glob("runs/*/seed-0"))[index] for index, home in enumerate(homes)]
+    out = tmp_path / "public"
+    build_from_runs(runs, out, public=True)
+    rows = list(csv.DictReader((out / "results.csv").open()))
+    assert {row["run"] for row in rows if row["run"]} == {f"{slug(row['method'])}-seed-0" for row in rows if row["run"]}
+    assert not [path for path in out.rglob("*") if path.suffix in (".csv", ".md", ".html") and "alice" in path.read_text()]
 
 
 def test_public_report_refuses_the_folder_of_the_runs(small_study: Path) -> None:
