@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,14 @@ def made_up_provenance(**given: Any) -> Provenance:
     return Provenance(**{key: value for key, value in table.items() if key != "schema"})
 
 
+@functools.cache
+def _provenance_of(truth: str) -> Provenance:
+    """Kept: simulations make thousands of runs."""
+    return made_up_provenance(truth_sha256=truth)
+
+
 def made_up_run(quality: dict[str, Score], method: str = "m", seed: int = 0, truth: str = "t", **scores: Any) -> Run:
     """A run that lies nowhere; ``scores`` are further fields of its scores."""
     given = {"views": (), "cost": {}} | scores
     record = Scores(method=method, seed=seed, quality=quality, **given)
-    return Run(Path(), method, seed, record, made_up_provenance(truth_sha256=truth), Environment(), ())
+    return Run(Path(), method, seed, record, _provenance_of(truth), Environment(), ())

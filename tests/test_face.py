@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from shared_folders import Once
 from training_fixtures import SMALL
 
 import invgraphics as ig
@@ -52,9 +54,10 @@ EXAMPLES = (
 
 
 @pytest.fixture(autouse=True)
-def _toy_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _toy_beside(tmp_path: Path, once: Once, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of its own for each test, with the data set that examples open."""
-    save_npz(toy_scene(views=8, size=24), tmp_path / "toy.npz")
+    made = once("toy-npz", lambda folder: save_npz(toy_scene(views=8, size=24), folder / "toy.npz"))
+    shutil.copy(made / "toy.npz", tmp_path)
     monkeypatch.chdir(tmp_path)
 
 

@@ -10,8 +10,9 @@ pytest.importorskip("resource", reason="limits of memory are POSIX's")
 import watched
 
 SCRIPT = """
-import sys, time
+import sys, time, types
 sys.path.insert(0, {folder!r})
+sys.modules["torch"] = types.SimpleNamespace(set_num_threads=lambda count: None)  # a second to import, at each of three starts
 import numpy as np, reader
 from invgraphics.errors import InputError
 

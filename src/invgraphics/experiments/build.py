@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 
 from invgraphics import kernels
@@ -110,6 +112,12 @@ def _view_share(recipe: Recipe, renderer: Renderer, scene: Scene) -> float:
 def use_kernels(name: str | None, device: torch.device) -> None:
     """Select the kernel backend by name, and compile its kernels for a device before any timing starts."""
     kernels.use(name)
+    _warm_up(device, kernels.in_use(device))
+
+
+@functools.cache
+def _warm_up(device: torch.device, backend: str) -> None:
+    """Warm a backend's kernels up, once in a process."""
     kernels.warm_up(device)
 
 
