@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from invgraphics.cli import main
 from invgraphics.errors import InputError
 from invgraphics.metrics.conventions import PROTOCOLS
 from invgraphics.recipes.aliases import ALIASES
@@ -63,6 +64,23 @@ def test_methods_exist(guide: str) -> None:
     assert len(named) > 5 and named <= set(KEYS)
 
 
+@pytest.mark.parametrize("guide", GUIDES)
+def test_options_exist(guide: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Options of our commands, and those that stand alone in the column of what to change or type here."""
+    commands = ("fit", "compare", "rescore", "export", "render", "explain", "import-photos")
+    known = set()
+    for command in commands:
+        with pytest.raises(SystemExit):
+            main.run([command, "--help"])
+        known |= set(re.findall(r"--[a-z-]+", capsys.readouterr().out))
+    rows = [line.split("|")[2:] for line in (DOCS / guide).read_text().splitlines() if line.startswith("|")]
+    named = [span for row in rows for cell in row for span in re.findall(r"`([^`]+)`", cell)]
+    ours = [span for span in named if re.match(r"--|invgraphics |rescore ", span)]
+    options = {option for span in ours for option in re.findall(r"--[a-z-]+", span)}
+    assert len(options) > 4
+    assert options - known <= {"--pipeline"}  # nerfstudio's, in a table of conventions
+
+
 def test_what_gsplat_calls_its_settings_has_these_values_in_ours() -> None:
     """Values that stand beside a key of splatting's growth are those of its preset."""
     told = dict(match.groups() for span in spans("coming-from.md") if (match := SETTING.fullmatch(span)) and match[2])
@@ -79,9 +97,7 @@ def test_names_of_methods_and_protocols_of_other_tools() -> None:
     for name in ("splatfacto", "instant-ngp", "nerfacto"):
         assert name in ALIASES and f"`{name}`" in text
     assert "gsplat" in PROTOCOLS
-    tools = {
-        re.split("[-]metrics|-train|-nerf$|-splatfacto", name)[0] for name, protocol in PROTOCOLS.items() if protocol.source
-    }
+    tools = {re.split("-metrics|-train|-nerf$|-splatfacto", name)[0] for name, protocol in PROTOCOLS.items() if protocol.source}
     assert len(tools) == 7, tools
 
 
