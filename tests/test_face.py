@@ -23,7 +23,7 @@ from shared_folders import Once
 from training_fixtures import SMALL
 
 import invgraphics as ig
-from invgraphics.api.loading import reopenable_scene
+from invgraphics.api.keeping import reopenable_scene
 from invgraphics.core import Scene, View
 from invgraphics.core.transforms import look_at
 from invgraphics.errors import InputError, NotComposableError
@@ -32,7 +32,8 @@ from invgraphics.experiments.display import ScoreTable
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
-from invgraphics.scenes.npz import Npz, save_npz
+from invgraphics.scenes.npz import Npz
+from invgraphics.scenes.npz_writer import save_npz
 from invgraphics.scenes.open import SceneOptions, source_of
 from invgraphics.scenes.truth import POINTS as EXACT_POINTS
 from invgraphics.testing import toy_scene
@@ -337,6 +338,7 @@ def test_objects_show_themselves() -> None:
         pixels = torch.from_numpy(np.array(Image.open(io.BytesIO(shown._repr_png_())))) / 255
         assert torch.allclose(pixels, colours.clamp(0, 1), atol=0.5 / 255 + 1e-6)
     assert picture.reshape(24 * 24)._repr_png_() is None
+    assert repr(scene).startswith("Scene(scene: ") and "8 to fit, 0 to watch" in repr(scene) and len(repr(scene)) < 300
     assert "8 to fit, 0 to watch" in scene._repr_html_() and "data:image/png;base64," in scene._repr_html_()
     curve = ElementTree.fromstring(fit._repr_svg_())
     (line,) = curve.iter("{http://www.w3.org/2000/svg}polyline")

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 import invgraphics as ig
+from invgraphics.data import find
 from invgraphics.errors import InputError
-from invgraphics.scenes.npz import save_npz
+from invgraphics.scenes.npz_writer import save_npz
 from invgraphics.studies.factors import override
 from invgraphics.tables import parse_toml
 from invgraphics.testing import toy_scene
@@ -92,6 +93,14 @@ def test_lists_of_tables_and_numpys_values_can_be_set() -> None:
 def test_values_on_one_line_of_toml_read_as_they_were(value: object) -> None:
     text = override("a", value).removeprefix("a=")
     assert "\n" not in text and parse_toml(f"value = {text}", "it")["value"] == value
+
+
+def test_a_recipe_s_table_is_a_method() -> None:
+    table = parse_toml((find("renderers") / "volumetric" / "hash.toml").read_text(), "the recipe")
+    ours, named = (ig.load_method(what, preset="long", set={"field.width": 32}) for what in (table, "volumetric/hash"))
+    assert (ours.digest, ours.preset) == (named.digest, "long") and "presets" in table
+    with pytest.raises(InputError, match="A method's name has one line"):
+        ig.load_method('summary = "Mine"\npaper = "none"\n')
 
 
 def test_wrong_kinds_of_arguments_are_sentences() -> None:

@@ -23,6 +23,9 @@ T = TypeVar("T")
 OMIT_EMPTY = {"omit_empty": True}
 """Metadata of a field that is left out of tables where it is empty, so that tables without it stay as they were."""
 
+BUILT = ("fields", "encodings", "renderers", "samplers", "hooks")
+"""Registries whose configs build something; those of the others are the thing itself."""
+
 
 @dataclass(frozen=True)
 class Slot:
@@ -73,6 +76,10 @@ def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
     schema = plugins.load(registry, str(table["type"]))
     if not (isinstance(schema, type) and dataclasses.is_dataclass(schema)):
         raise InputError(f"'{table['type']}' of the {registry} is {schema!r}, no dataclass.", "See docs/extending.md.")
+    if registry in BUILT and not callable(getattr(schema, "build", None)):
+        raise InputError(
+            f"'{table['type']}' of the {registry}, {schema.__name__}, has no method 'build'.", "See docs/extending.md."
+        )
     return fill(schema, rest, path)
 
 

@@ -37,6 +37,10 @@ REGISTRIES = {
     "executors": ("invgraphics.experiments.executors", "EXECUTORS"),
 }
 """Registry name -> (module, dictionary). ``recipes`` starts empty: built-in recipes are TOML files."""
+GROUP = "invgraphics."
+"""How the groups of entry points begin."""
+BY_CLASS = ("fields", "encodings", "renderers", "samplers", "losses", "penalties", "hooks")
+"""Registries whose parts `name_of` finds by their class."""
 
 
 @cache
@@ -48,19 +52,37 @@ def _own(registry: str) -> dict[str, str]:
 @cache
 def _entry_points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Entry points of this package's groups found on ``path``, cached because scanning installed packages is slow."""
-    found = entry_points()
-    return tuple(point for registry in REGISTRIES for point in found.select(group=f"invgraphics.{registry}"))
+    known = entry_points()
+    groups = sorted(group for group in known.groups if group.startswith(GROUP))
+    found = [point for group in groups for point in known.select(group=group)]
+    for point in found:
+        group = point.group.removeprefix(GROUP)
+        if group not in REGISTRIES:
+            leave_out(f"{_described(point)}: there is no group '{point.group}'.{did_you_mean(group, REGISTRIES)}")
+    return tuple(found)
+
+
+def _described(point: EntryPoint) -> str:
+    """An entry point with its target and its package."""
+    package = point.dist.name if point.dist is not None else "unknown package"
+    return f"'{point.name}' of the {point.group.removeprefix(GROUP)} ({point.value}, {package})"
 
 
 def _foreign(registry: str) -> dict[str, EntryPoint]:
-    """A registry's entry points by name; those whose name a built-in part has are left out, with a warning."""
-    points = {}
+    """A registry's entry points by name; second names, of built-in parts or of one class, are left out, with a warning.
+
+    A resolved recipe names each part by its class, so that a class has one name.
+    """
+    points: dict[str, EntryPoint] = {}
     for point in _entry_points(tuple(sys.path)):
-        if point.group != f"invgraphics.{registry}":
+        if point.group != f"{GROUP}{registry}":
             continue
+        named = _own(registry) | {name: other.value for name, other in points.items()} if registry in BY_CLASS else {}
+        twin = next((name for name, target in named.items() if target == point.value), None)
         if _is_built_in(registry, point.name):
-            package = point.dist.name if point.dist is not None else "unknown package"
-            leave_out(f"'{point.name}' of the {registry} ({point.value}, {package}): a built-in has this name.")
+            leave_out(f"{_described(point)}: a built-in has this name.")
+        elif twin is not None:
+            leave_out(f"{_described(point)}: '{twin}' is the same.")
         else:
             points[point.name] = point
     return points
@@ -132,6 +154,23 @@ def raised_in(error: BaseException) -> str:
             found = f"{module}.{trace.tb_frame.f_code.co_qualname}{version}"
         trace = trace.tb_next
     return found
+
+
+def unexpected(error: BaseException) -> tuple[str, str]:
+    """What an error is that no input should cause, and whose fault: of a plug-in where it was raised in one, or may be."""
+    first = (str(error).splitlines() or [""])[0]
+    if where := raised_in(error):
+        fault = f"It was raised in {where}"
+    else:
+        fault = f"This is a fault of {' or '.join(['invgraphics', *_imported()])}, not of your input"
+    return f"Unexpected {type(error).__name__}: {first}", fault
+
+
+def _imported() -> list[str]:
+    """Distributions of the plug-ins that this process has imported."""
+    points = [point for registry in REGISTRIES for point in _foreign(registry).values()]
+    used = [point.dist for point in points if point.dist is not None and _package(point) in sys.modules]
+    return list(dict.fromkeys(f"{dist.name} {dist.version}" for dist in used))
 
 
 def _used(table: Mapping[str, Any], method: str) -> list[tuple[str, EntryPoint]]:
@@ -214,4 +253,5 @@ def name_of(registry: str, kind: type) -> str:
     for name, found in load_all(registry, _foreign(registry)):
         if found is kind:
             return name
-    raise InputError(f"{wanted} is not registered among the {registry}.")
+    how = f'Declare an entry point in the group "{GROUP}{registry}", and install its package (docs/extending.md).'
+    raise InputError(f"{wanted} is not registered among the {registry}.", how)

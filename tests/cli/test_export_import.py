@@ -192,6 +192,7 @@ def test_what_cannot_be_exported(run: Path, toy_folder: Path, tmp_path: Path, ca
     capsys.readouterr()
     for words, sentence in (
         ([str(neural), "--to", "ply", "--out", str(tmp_path / "a.ply")], "has no Gaussians to write as ply"),
+        ([str(neural), "--to", "spz", "--out", str(tmp_path / "a.spz")], f"convert {neural} --to gaussians --out RUN"),
         ([str(run), "--to", "obj", "--out", str(tmp_path / "a.obj")], "--to cannot be 'obj'"),
         ([str(tmp_path), "--to", "ply", "--out", str(tmp_path / "a.ply")], "is not a run"),
         ([str(run), "--to", "ply", "--out", str(tmp_path / "file" / "a.ply")], "cannot be made"),

@@ -35,6 +35,7 @@ COMPARE = ["compare", "bricks", "--out", "no/report", "--methods"]
             ["ablate", "families", "--gpus", "0"],
             "--gpus does nothing on this machine.\nLeave out --gpus, or add --executor ray.",
         ),
+        ([*FIT, "--keep"], "--keep does nothing without --resume."),
         (["ablate", "families", "--gpus", "1", "--address", "a:1"], "--gpus and --address do nothing on this machine."),
         (["infer", "no/run", "--azimuth", "0"], "--azimuth does nothing without a photograph."),
         (["infer", "no/run", "--view", "a", "--elevation", "0"], "--view and --elevation do nothing without a photograph."),

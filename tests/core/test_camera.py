@@ -1,9 +1,11 @@
 """The pinhole camera: rays and projection undo each other, also under resizing, and both differentiate in the pose."""
 
+import pytest
 import torch
 
 from invgraphics.core import Camera
 from invgraphics.core.transforms import look_at, se3_exp
+from invgraphics.errors import InputError
 
 F64 = torch.float64
 
@@ -12,6 +14,13 @@ def camera() -> Camera:
     eye, target = torch.tensor([1.0, -2.0, 0.7], dtype=F64), torch.tensor([0.1, 0.2, 0.0], dtype=F64)
     pose = look_at(eye, target, torch.tensor([0.0, 0.0, 1.0], dtype=F64))
     return Camera(pose, torch.tensor([21.0, 24.0], dtype=F64), torch.tensor([8.3, 5.1], dtype=F64), 16, 12)
+
+
+@pytest.mark.parametrize("name", ["cam_to_world", "focal", "principal_point"])
+def test_plain_numbers_are_no_tensors(name: str) -> None:
+    tensors = {"cam_to_world": torch.eye(4), "focal": torch.ones(2), "principal_point": torch.ones(2)}
+    with pytest.raises(InputError, match=f"The camera's '{name}' is float"):
+        Camera(**tensors | {name: 26.0}, width=2, height=2)
 
 
 def test_pixel_centres_are_at_a_half_and_run_row_by_row() -> None:

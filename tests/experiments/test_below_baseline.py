@@ -9,7 +9,7 @@ import torch
 from training_fixtures import SMALL
 
 import invgraphics as ig
-from invgraphics.core import Bounds, Camera, Rendering, Scene, View
+from invgraphics.core import Bounds, Camera, Points, Rendering, Scene, View
 from invgraphics.experiments import evaluate
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.evaluate import evaluate_run
@@ -67,6 +67,9 @@ def test_says_why_and_what_to_try(method: str, colour: float, alpha: float, dept
             "volumetric/hash-proposal": "--optimise exposure",
         }
         assert remedies.get(method, "") in found
+        points = replace(shown, points=Points(torch.zeros(2, 3), torch.zeros(2, 3)))
+        known = below_baseline(method, quality, seen, points, rules, gaussians=splats)
+        assert [("starts from known points" in text) for text in (found, known)] == [False, not splats]
     else:
         assert found == ""
 

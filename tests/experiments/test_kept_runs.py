@@ -57,7 +57,7 @@ def test_another_recipe_is_another_run_at_every_size(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("keep", [False, True])
 def test_a_comparison_that_is_interrupted_lists_no_run_of_earlier_code(
-    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: bool
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], keep: bool
 ) -> None:
     """Such a run was about to be fitted again; what this code made, or what the command keeps, is part of the comparison."""
     ended = []
@@ -93,3 +93,5 @@ def test_a_comparison_that_is_interrupted_lists_no_run_of_earlier_code(
     found = [Path(name).name for name in json.loads((tmp_path / "compare.json").read_text())["runs"]]
     assert ended == (["seed-2"] if keep else ["seed-0", "seed-1", "seed-2"])
     assert found == (["seed-0", "seed-1"] if keep else ["seed-1"])
+    replaced = "1 finished run is of other code or pictures, and fitted again; --keep keeps what other code made."
+    assert (replaced in capsys.readouterr().err) is not keep

@@ -329,6 +329,44 @@ def test_a_fit_that_goes_on_elsewhere_keeps_where_it_began(
     assert capsys.readouterr().err.count("the fit was begun elsewhere (An abacus, 3 cores") == 1
 
 
+def test_a_fit_goes_on_by_other_code_where_that_is_asked_for(
+    run: Path, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A fit that stopped in a faulty hook, say, goes on once that is mended; its record names the code before."""
+    folder, before = shutil.copytree(run, tmp_path / "run"), json.loads((run / "provenance.json").read_text())
+    (folder / "scores.json").unlink()
+    for user in ("identity", "run", "environment"):
+        monkeypatch.setattr(f"invgraphics.experiments.{user}.code_version", lambda: "9.9+later")
+    with pytest.raises(InputError, match=r"holds a run of other code, threads or kernels\.\nAdd --keep to go on with it"):
+        fit_run(_request(toy_folder, folder, existing="resume"))
+    record = json.loads((folder / "provenance.json").read_text())
+    (folder / "provenance.json").write_text(json.dumps(record | {"train_sha256": "0" * 64}))
+    with pytest.raises(InputError, match="holds a run of other pictures of the same scene"):
+        fit_run(_request(toy_folder, folder, existing="resume", keep=True))
+    (folder / "provenance.json").write_text(json.dumps(record))
+    for _ in range(2):  # the second time the code is the same
+        fit_run(_request(toy_folder, folder, existing="resume", keep=True))
+        found = json.loads((folder / "environment.json").read_text())
+        assert found["begun_on"] == [f"code: invgraphics {before['code_version']}"]
+        (folder / "scores.json").unlink()
+    after = json.loads((folder / "provenance.json").read_text())
+    assert after["code_version"] == "9.9+later" and after["cell_sha256"] != before["cell_sha256"]
+    assert capsys.readouterr().err.count("the fit was begun by other code (invgraphics ") == 1
+
+
+def test_a_checkpoint_that_other_code_cannot_read_is_refused(
+    run: Path, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shutil.copytree(run, tmp_path / "run")
+    (folder / "scores.json").unlink()
+    state = load(folder / CHECKPOINT)
+    name = next(key for key in state["field"] if state["field"][key].ndim > 1)
+    save(folder / CHECKPOINT, state | {"field": state["field"] | {name: state["field"][name][..., :1]}})
+    monkeypatch.setattr("invgraphics.experiments.identity.code_version", lambda: "9.9+later")
+    with pytest.raises(InputError, match=f"does not fit the code of today: .*{name}"):
+        fit_run(_request(toy_folder, folder, existing="resume", keep=True))
+
+
 def _spawn(request: FitRequest, folder: Path) -> subprocess.Popen:
     job = folder / "job.json"
     job.write_text(json.dumps(request.to_json()))
@@ -387,6 +425,21 @@ def test_a_full_disk_is_said_and_keeps_the_last_checkpoint(toy_folder: Path, tmp
         assert int(load(small / "run" / CHECKPOINT)["fit"]["steps"]) > 0
     finally:
         subprocess.run(["umount", str(small)], check=True)
+
+
+def test_a_fit_that_fails_unexpectedly_leaves_the_kind_of_its_error(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A report's line of a failed fit is all that its reader sees: the text of a KeyError alone is a name in quotes."""
+
+    def fail(request: FitRequest) -> Path:
+        raise KeyError("means")
+
+    monkeypatch.setattr(module, "fit_run", fail)
+    (tmp_path / "job.json").write_text(json.dumps(_request(toy_folder, tmp_path / "run").to_json()))
+    assert module.work(tmp_path / "job.json") == 1
+    said = json.loads((tmp_path / "job.error.json").read_text())["error"]
+    assert said == "Unexpected KeyError: 'means' (this is a fault of invgraphics, not of your input)"
 
 
 def test_a_damaged_run_gets_a_sentence(run: Path, tmp_path: Path) -> None:

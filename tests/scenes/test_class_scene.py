@@ -19,7 +19,8 @@ from invgraphics.scenes.mitsuba import cache, llvm, make, maker
 from invgraphics.scenes.mitsuba.build import chairs, mugs
 from invgraphics.scenes.mitsuba.build.mesh import merge
 from invgraphics.scenes.mitsuba.spec import Instances, class_names, description_path, read
-from invgraphics.scenes.npz import Npz, save_npz
+from invgraphics.scenes.npz import Npz
+from invgraphics.scenes.npz_writer import save_npz
 from invgraphics.scenes.open import open_scene, validate
 
 FEW = """views = { train = 2, val = 1, test = 1 }

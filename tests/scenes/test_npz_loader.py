@@ -12,7 +12,8 @@ from dots import COLOURS, POINTS, assert_dots_are_found, ring
 from invgraphics.core import Bounds, View
 from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
-from invgraphics.scenes.npz import Npz, save_npz
+from invgraphics.scenes.npz import Npz
+from invgraphics.scenes.npz_writer import save_npz
 from invgraphics.scenes.open import open_scene, validate
 from invgraphics.testing import toy_scene
 

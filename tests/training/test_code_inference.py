@@ -24,7 +24,7 @@ from invgraphics.report.inference import build_inference_report, inference_sente
 from invgraphics.report.statistics.instances import mean_of, paired, table_of
 from invgraphics.runs.inference import Inference, InstanceScores
 from invgraphics.runs.study import CellRecord, StudyRecord
-from invgraphics.scenes.npz import save_npz
+from invgraphics.scenes.npz_writer import save_npz
 from invgraphics.testing import toy_scene
 from invgraphics.tools import infer as module
 from invgraphics.tools import infer_photo, inference_pictures

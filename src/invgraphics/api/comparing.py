@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+from invgraphics.api.keeping import reopenable_scene
 from invgraphics.api.loading import (
     MethodLike,
     as_scene,
@@ -15,7 +16,6 @@ from invgraphics.api.loading import (
     listed,
     load_run,
     name_of,
-    reopenable_scene,
     whole_seeds,
 )
 from invgraphics.core import Scene

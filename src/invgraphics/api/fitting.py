@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack, overload
 
-from invgraphics.api.loading import MethodLike, as_scene, data_overrides, reopenable_scene, resolved, whole_seeds
+from invgraphics.api.keeping import reopenable_scene
+from invgraphics.api.loading import MethodLike, as_scene, data_overrides, resolved, whole_seeds
 from invgraphics.core import Model, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.display import ScoreTable

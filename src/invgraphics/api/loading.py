@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import tomlkit
-import torch
-from torch import Tensor
 
-from invgraphics.core import Scene, View
+from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
 from invgraphics.experiments.fitted import load_fitted, open_fitted
@@ -22,18 +20,15 @@ from invgraphics.experiments.session import FolderRun
 from invgraphics.files import write_text
 from invgraphics.recipes import recipe
 from invgraphics.recipes.recipe import Method
-from invgraphics.runs.folder import SCENE_COPY, RunFolder, check_run
-from invgraphics.scenes.npz import save_npz, unsupported_parts
-from invgraphics.scenes.open import SceneOptions, open_scene, source_of, validate
+from invgraphics.runs.folder import RunFolder, check_run
+from invgraphics.scenes.npz_writer import save_npz
+from invgraphics.scenes.open import SceneOptions, validate
 from invgraphics.studies.factors import override
 from invgraphics.tables import plain
 from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
 
 T = TypeVar("T")
-
-CAMERA = ("cam_to_world", "focal", "principal_point")
-"""Tensors of a camera; its size is that of the picture."""
 
 MethodLike: TypeAlias = str | os.PathLike[str] | Mapping[str, Any] | Method
 """A method's name, the path of a recipe, a recipe as a table, or a method that `load_method` returned."""
@@ -100,11 +95,13 @@ def save_scene(scene: Scene, path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def load_method(method: str | os.PathLike[str], *, preset: str | None = None, set: Mapping[str, Any] | None = None) -> Method:
+def load_method(
+    method: str | os.PathLike[str] | Mapping[str, Any], *, preset: str | None = None, set: Mapping[str, Any] | None = None
+) -> Method:
     """Read a method's recipe, with values of it changed.
 
     Args:
-        method: ``renderer/recipe`` or the path of a recipe.
+        method: ``renderer/recipe``, the path of a recipe, or a recipe as a table, as ``tomllib.loads`` reads it.
         preset: one of the recipe's presets; ``None`` leaves the choice to the budget of the fit that gets the method, and shows
             the one for short budgets.
         set: dotted path of a value in the recipe -> its new value. What changes the training data instead (``data.init``) is
@@ -127,7 +124,15 @@ def load_method(method: str | os.PathLike[str], *, preset: str | None = None, se
             remedy = f"Give it to ig.fit or ig.compare: data={{{key!r}: {value!r}}}."
             raise InputError(f"'{path}' changes the training data, which is no part of a method.", remedy)
     changes = [override(path, value) for path, value in (set or {}).items()]
-    return recipe.load_method(":".join([os.fspath(method), *([f"preset={preset}"] if preset else []), *changes]))
+    if isinstance(method, Mapping):
+        return recipe.method_from(_plain_table(method), "recipe", preset, changes)
+    if not isinstance(method, str | os.PathLike):
+        raise InputError(
+            f"A method cannot be {type(method).__name__}.", "Expected: its name, the path of a recipe, or a table."
+        )
+    if "\n" in (name := os.fspath(method)):
+        raise InputError("A method's name has one line.", "Of a recipe's text, give the table: tomllib.loads(text).")
+    return recipe.load_method(":".join([name, *([f"preset={preset}"] if preset else []), *changes]))
 
 
 def load_run(folder: str | os.PathLike[str], scene: Scene | str | None = None) -> FolderRun:
@@ -229,64 +234,16 @@ def _name_or_table(method: MethodLike) -> str | dict[str, Any]:
         with suppress(InputError):  # a name that was given to a table
             if recipe.load_method(method.name, method.preset or None).digest == method.digest:
                 return method.name
-    try:
-        return plain(method.table if isinstance(method, Method) else method)
-    except ValueError as error:
-        raise InputError(f"The table is no recipe: {error}.") from error
+    return _plain_table(method.table if isinstance(method, Method) else method)
 
 
-def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:
-    """Scene and name by which other processes open it: as it was opened, or as a copy written to ``folder``.
+def _plain_table(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A recipe's table as plain values, as TOML has them.
 
     Raises:
-        InputError: the scene was made in Python and cannot be kept, or the folder holds another one.
+        InputError: TOML has no such values.
     """
-    source = source_of(scene)
-    if source is not None and (source.options.train_views, source.options.seed) == (None, 0):
-        options = source.options
-        return scene, {"scene": source.spec, "size": options.size, "test_views": options.test_views, "spp": options.spp}
-    path, present = folder / SCENE_COPY, (folder / SCENE_COPY).is_file()
-    if not present:
-        save_npz(scene, path)
-    elif beyond := unsupported_parts(scene):
-        raise InputError(f"{path} holds another scene: this one has {beyond}.", "Choose another out.")
-    kept = open_scene(str(path), SceneOptions(test_views=None))
-    if present and not _same(scene, kept):
-        raise InputError(f"{path} holds another scene.", "Choose another out.")
-    return kept, {"scene": str(path), "test_views": None}
-
-
-def _same(one: Scene, other: Scene) -> bool:
-    """Whether two scenes are equal in all that a file keeps.
-
-    What is read may differ by rounding: poses are re-orthonormalised, colours of points have 8 bits.
-    """
-    for split in ("train", "val", "test", "observed"):
-        views, others = getattr(one, split), getattr(other, split)
-        if len(views) != len(others) or not all(_same_view(a, b) for a, b in zip(views, others, strict=True)):
-            return False
-    box = all(_close(getattr(one.bounds, corner), getattr(other.bounds, corner)) for corner in ("lo", "hi"))
-    if (one.points is None) != (other.points is None) or not box:
-        return False
-    if one.points is None or other.points is None:
-        return True
-    return _close(one.points.position, other.points.position) and _close(one.points.rgb.clamp(0, 1), other.points.rgb, 1 / 255)
-
-
-def _same_view(one: View, other: View) -> bool:
-    exact = all(_close(getattr(one, part), getattr(other, part), 0.0) for part in ("image", "alpha"))
-    cameras = all(_close(getattr(one.camera, part), getattr(other.camera, part)) for part in CAMERA)
-    return (
-        exact
-        and cameras
-        and one.subject == other.subject
-        and _close(one.depth, other.depth)
-        and _close(one.normal, other.normal)
-    )
-
-
-def _close(one: Tensor | None, other: Tensor | None, most: float = 1e-5) -> bool:
-    """Whether two tensors have equal shapes and differ by at most ``most``; ``None`` equals itself alone."""
-    if one is None or other is None:
-        return one is other
-    return one.shape == other.shape and torch.allclose(one.double(), other.double(), rtol=1e-6, atol=most)
+    try:
+        return plain(table)
+    except ValueError as error:
+        raise InputError(f"The table is no recipe: {error}.") from error

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from invgraphics.cli.arguments import Shared, check_seed
+from invgraphics.cli.arguments import Shared, check_seed, refuse_idle
 from invgraphics.cli.output import show_scores
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import FitRequest
@@ -34,6 +34,8 @@ class Fit(Shared):
     """Keep N states of the model, evenly over the fit, besides the first, for `invgraphics render RUN --path timelapse`."""
     resume: bool = False
     """Continue the run in --out from its last checkpoint."""
+    keep: bool = False
+    """With --resume: continue although the code, of invgraphics or of a plug-in, has changed since; the record says so."""
 
     def run(self) -> int:
         """Run the fit; prints its scores and its folder. Returns exit status 0."""
@@ -59,7 +61,9 @@ class Fit(Shared):
         name = f"{Path(self.scene).resolve().name}-{slug(self.method)}-seed-{seed}"
         out = Path("runs") / name if self.out is None else self.out
         existing = "resume" if self.resume else "refuse"
+        if not self.resume:
+            refuse_idle({"--keep": self.keep or None}, "without --resume")
         if self.snapshots < 0:
             raise InputError(f"--snapshots cannot be {self.snapshots}.", "Expected a number of states, 0 or more.")
-        settings: dict[str, Any] = self.settings() | {"snapshots": self.snapshots}
+        settings: dict[str, Any] = self.settings() | {"snapshots": self.snapshots, "keep": self.keep}
         return FitRequest(method=self.method, scene=self.scene, seed=seed, out=str(out), existing=existing, **settings)

@@ -131,10 +131,8 @@ def explain(error: Exception) -> tuple[int, list[str]]:
         return BAD_INPUT, str(fault).splitlines()
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in str(error):
         return FAILED, ["There is not enough memory.", "Try a smaller --size, or smaller settings of the method (--set)."]
-    first = (str(error).splitlines() or [""])[0]
-    where = plugins.raised_in(error)
-    fault = f"It was raised in {where}" if where else "This is a fault of invgraphics, not of your input"
-    return FAILED, [f"Unexpected {type(error).__name__}: {first}", f"{fault}; --debug shows where it happened."]
+    what, fault = plugins.unexpected(error)
+    return FAILED, [what, f"{fault}; --debug shows where it happened."]
 
 
 def _command(name: str) -> Any:

@@ -12,7 +12,8 @@ from invgraphics.cli.output import show_table
 from invgraphics.cli.report import runs_in
 from invgraphics.errors import InputError
 from invgraphics.runs.comparison import ComparisonRecord
-from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.folder import RUNS, RunFolder
+from invgraphics.runs.study import StudyRecord
 
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -46,6 +47,10 @@ class Rescore:
         from invgraphics.tools.rescoring import best_sets, rows_of, skip_reasons, write_scores, write_tables
 
         protocols = protocols_named(self.protocol)
+        for folder in self.folders:
+            if RunFolder(folder).has(StudyRecord):
+                remedy = f"Give runs of one scene at one size: {folder / RUNS}/SCENE-*."
+                raise InputError(f"'{folder}' is a study, whose runs do not share their truth.", remedy)
         compared = {folder: RunFolder(folder).has(ComparisonRecord) for folder in self.folders}
         folders = [one for folder in self.folders for one in (runs_in(folder) if compared[folder] else [folder])]
         results = rescore([open_pictures(folder, self.truth, background) for folder in folders], protocols, self.allow_8bit)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.rays import Rays
+from invgraphics.errors import InputError
 
 CHUNK = 1 << 15
 """Points whose distances to all cameras are held at once."""
@@ -34,6 +35,11 @@ class Camera:
     principal_point: Float[Tensor, 2]
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        for name, shape in (("cam_to_world", "(4, 4)"), ("focal", "(2,)"), ("principal_point", "(2,)")):
+            if not isinstance(value := getattr(self, name), Tensor):
+                raise InputError(f"The camera's '{name}' is {type(value).__name__}.", f"Expected: a tensor of shape {shape}.")
 
     @property
     def position(self) -> Float[Tensor, 3]:

@@ -232,20 +232,27 @@ class Scene:
                     sha.update(np.ascontiguousarray(values.cpu().numpy()).tobytes())
         return sha.hexdigest()
 
+    def __repr__(self) -> str:
+        """The scene's facts on a line: its tensors would fill thousands."""
+        return f"Scene({', '.join(f'{key}: {value}' for key, value in self._facts().items())})"
+
     def _repr_html_(self) -> str:
         """A contact sheet and the scene's facts, in a notebook."""
         pictures = [view.over(self.background).cpu() for view in (*self.train[:12], *self.test[:4])]
         shown = [linear_to_srgb(picture) for picture in pictures] if self.colour == "linear" else pictures
+        return figure_html(contact_sheet(shown), self._facts())
+
+    def _facts(self) -> dict[str, str]:
         sizes = {f"{view.camera.width} x {view.camera.height}" for view in (*self.train, *self.test)}
-        facts = {
+        lo, hi = ([round(value, 3) for value in corner.tolist()] for corner in (self.bounds.lo, self.bounds.hi))
+        return {
             "scene": self.name,
             "views": f"{len(self.train)} to fit, {len(self.val)} to watch, {len(self.test)} to score",
             "pixels": ", ".join(sorted(sizes)),
-            "bounds": f"{self.bounds.space}, {self.bounds.lo.tolist()} to {self.bounds.hi.tolist()}",
+            "bounds": f"{self.bounds.space}, {lo} to {hi}",
             "colour": f"{self.colour}, {'with alpha' if self.has_alpha else 'opaque'}",
             "points": "none" if self.points is None else f"{len(self.points):,}",
         }
-        return figure_html(contact_sheet(shown), facts)
 
     def camera_digest(self) -> str:
         """SHA-256 of all cameras, split by split, views in their order."""

@@ -66,11 +66,11 @@ def below_baseline(
 
 def _diagnose(method: str, means: Mapping[str, float], scene: Scene) -> tuple[str, str]:
     """Select cause and remedy of fog by the family of the method, the kind of scene and the statistics of its renderings."""
-    others = ["splatting/gaussians, which starts from known points"]
+    others = [] if scene.points is None else ["splatting/gaussians, which starts from known points"]
     if is_open_space(scene):
         suited = method.startswith(OPEN)
         others.insert(0, "--optimise exposure, where photographs differ in it" if suited else f"{OPEN[0]}, for open spaces")
-    remedy = f"a longer --budget, a smaller --size, more photographs, {', or '.join(others)}"
+    remedy = ", ".join(["a longer --budget", "a smaller --size", ", or ".join(["more photographs", *others])])
     if means["relative_depth"] < FLOATER_DEPTH:
         where = f"median depth {means['relative_depth']:.0%} of the way to the scene's middle"
         return f"fog hangs in front of the cameras ({where})", remedy

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+from typing import Any, TypeVar
 
 import torch
+from torch import nn
 
 from invgraphics import kernels
-from invgraphics.core import Field, Model, RayRenderer, Renderer, Scene
+from invgraphics.core import Field, Model, Quantity, RayRenderer, Renderer, Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.memory_check import check_memory
 from invgraphics.experiments.progress import Reporter
@@ -61,10 +63,8 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
     """
     check_memory(method, scene)
     torch.manual_seed(seed)
-    field, renderer = method.recipe.field.build(scene), method.recipe.renderer.build(scene)
-    for part, kind in ((field, Field), (renderer, Renderer)):
-        if not isinstance(part, kind):
-            raise InputError(f"{part!r}, which {method.name} builds, is no {kind.__name__}.", "See docs/extending.md.")
+    field = _built(method.recipe.field, scene, Field, "provides")
+    renderer = _built(method.recipe.renderer, scene, Renderer, "requires")
     check_subjects(field, renderer, scene, method.name)
     model = Model(as_shown(field, renderer) if shown else field, renderer, scene.bounds)
     training = method.recipe.training
@@ -72,6 +72,30 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
         for encoding in coarse_to_fine_encodings(model):
             encoding.add_window()
     return model.to(device)
+
+
+P = TypeVar("P", bound=nn.Module)
+
+
+def _built(config: Any, scene: Scene, kind: type[P], declares: str) -> P:
+    """Build a part from its config, which a third party may have written.
+
+    Args:
+        config: of the recipe.
+        scene: it is built for.
+        kind: class that it must have.
+        declares: its attribute that holds quantities.
+
+    Raises:
+        InputError: the config builds no such part, or one that declares nothing.
+    """
+    where = "See docs/extending.md."
+    part = config.build(scene)
+    if not isinstance(part, kind):
+        raise InputError(f"{part!r}, which {type(config).__name__} builds, is no {kind.__name__}.", where)
+    if not isinstance(getattr(part, declares, None), Quantity):
+        raise InputError(f"{type(part).__name__} declares no quantities as '{declares}'.", where)
+    return part
 
 
 def build_plan(method: Method, scene: Scene, budget: Budget, seed: int, device: torch.device) -> Plan:

@@ -68,7 +68,7 @@ def any_finished(request: CompareRequest) -> bool:
 def made_before(request: CompareRequest, jobs: Sequence[Job], scene: Scene | None) -> set[str]:
     """Folders of finished runs that count though no fit of this command has ended: of this code and these pictures, or kept.
 
-    Those of earlier code are about to be replaced, and are no result of this command if it is interrupted before.
+    Those of earlier code are about to be replaced, as a warning says; they are no result of a command that is interrupted.
 
     Args:
         request: with its methods.
@@ -78,7 +78,7 @@ def made_before(request: CompareRequest, jobs: Sequence[Job], scene: Scene | Non
     if scene is None:
         return set()
     methods, truth = {job.request.method: job.method for job in jobs}, ""
-    found = set()
+    found, replaced = set(), 0
     for fit in request.fits():
         job = Job.of(fit, methods[fit.method])
         if request.keep and is_kept(job):
@@ -87,4 +87,14 @@ def made_before(request: CompareRequest, jobs: Sequence[Job], scene: Scene | Non
             truth = truth or truth_digest(scene)
             if job.folder.identity == run_digest(job, truth, torch.get_num_threads()):
                 found.add(fit.out)
+            else:
+                replaced += 1
+    warn_of_replaced(replaced)
     return found
+
+
+def warn_of_replaced(count: int) -> None:
+    """Warn of finished runs that are fitted again because code or pictures have changed, and name the way to keep them."""
+    if count:
+        what = "1 finished run is" if count == 1 else f"{count} finished runs are"
+        warn(f"{what} of other code or pictures, and fitted again; --keep keeps what other code made.")

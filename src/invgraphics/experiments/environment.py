@@ -83,6 +83,17 @@ def continued(here: Environment, before: Environment | None) -> Environment:
     return replace(here, begun_on=(*before.begun_on, *changed))
 
 
+def begun_by(before: Environment, code: str) -> Environment:
+    """Environment of a fit's earlier parts, with the code by which they were made: it goes on by other code.
+
+    Args:
+        before: that the fit's folder holds.
+        code: in words.
+    """
+    warn(f"Warning: the fit was begun by other code ({code}). The same command from the start may end elsewhere.")
+    return replace(before, begun_on=(*before.begun_on, f"code: {code}"))
+
+
 def _machine(found: Environment) -> str:
     """Machine and packages in words, without what differs between two processes on it."""
     packages = (f"{name} {number}" for name, number in found.packages.items() if number)

@@ -147,13 +147,36 @@ def _same_scene(folder: RunFolder, *names: str) -> bool:
     return len({place.resolve() if existing else os.path.normpath(place) for place in places}) == 1
 
 
-def other_run(folder: RunFolder, method: str) -> InputError:
-    """Error of resuming a method's run in a folder that passed `check_replaceable`, but holds a run of another identity."""
-    named = folder.read(Provenance).method if folder.has(Provenance) else method
-    what = "of other code, threads, kernels or pictures of the same scene"
-    if named != method:
-        what = f"called '{named}', not '{method}'"
-    return InputError(f"{folder.root} holds a run {what}.", "Choose another --out.")
+def check_resumable(job: Job, scene: Scene, training_scene: Scene) -> None:
+    """Check that a fit of another identity, which passed `check_replaceable`, may go on: that it is asked to be kept.
+
+    Args:
+        job: of the fit.
+        scene: as loaded.
+        training_scene: as the fit sees it.
+
+    Raises:
+        InputError: the folder's fit saw other pictures or cameras, has another name, or is not to be kept.
+    """
+    folder, method = job.folder, job.method.name
+    found, other = folder.read(Provenance), "Choose another --out."
+    if found.method != method:
+        raise InputError(f"{folder.root} holds a run called '{found.method}', not '{method}'.", other)
+    seen = (scene.digest("test"), training_scene.digest("train"), scene.camera_digest())
+    if seen != (found.truth_sha256, found.train_sha256, found.cameras_sha256):
+        raise InputError(f"{folder.root} holds a run of other pictures of the same scene.", other)
+    if not job.request.keep:
+        raise InputError(
+            f"{folder.root} holds a run of other code, threads or kernels.", f"Add --keep to go on with it. {other}"
+        )
+
+
+def earlier_code(job: Job) -> str:
+    """Code by which the folder's fit was made so far, in words: version of the sources, and plug-ins."""
+    found = job.folder.read(Provenance)
+    packages = ", ".join(sorted(set(found.plugins.values())))
+    ours = "the same invgraphics" if found.code_version == code_version() else f"invgraphics {found.code_version}"
+    return f"{ours} with {packages}" if packages else ours
 
 
 def _normalised(budget: str) -> str:

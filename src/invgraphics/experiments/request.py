@@ -136,6 +136,7 @@ class FitRequest(Settings):
         seed: of initial values and of the fit.
         existing: what to do with a run that is already there: ``refuse``; ``resume`` it, if it is the same; or ``reuse`` what
             is the same and replace what is not.
+        keep: whether a run is resumed although code, threads or kernels have changed since; its record names the earlier code.
         truth: folder for truth images, shared by runs; ``None`` for ``OUT/truth``.
         snapshots: how many states of the model are kept between start and end, for time-lapses.
     """
@@ -143,6 +144,7 @@ class FitRequest(Settings):
     method: str
     seed: int = 0
     existing: Existing = "refuse"
+    keep: bool = False
     truth: str | None = None
     snapshots: int = 0
 

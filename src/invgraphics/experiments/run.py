@@ -7,38 +7,37 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from invgraphics import plugins
 from invgraphics.core import Scene
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.build import (
     build_plan,
     configure_torch,
     open_with_progress,
     use_kernels,
 )
-from invgraphics.experiments.clocks import at_step, disturbance, fit_costs, fit_record, load_average
-from invgraphics.experiments.environment import code_version, continued, environment
+from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average
+from invgraphics.experiments.environment import begun_by, code_version, continued, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
-from invgraphics.experiments.identity import check_existing, other_run, run_digest, truth_digest
+from invgraphics.experiments.identity import check_existing, check_resumable, earlier_code, run_digest, truth_digest
 from invgraphics.experiments.job import Job, make_training_scene, region_of
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder, cut_snapshots
 from invgraphics.experiments.renderings import check_variants, render_missing
 from invgraphics.experiments.request import FitRequest
-from invgraphics.experiments.start import MemoryForecast, check_losses, initialise_field, memory_forecast, remove_empty
+from invgraphics.experiments.start import MemoryForecast, check_losses, initialise_field, memory_forecast, remove_empty, resume
 from invgraphics.files import file_fault
 from invgraphics.interruption import INTERRUPTED, Terminated, end_on_sigterm, end_with_parent
 from invgraphics.metrics.cost import PeakMemory
 from invgraphics.recipes.presets import announcements
 from invgraphics.recipes.recipe import Method
 from invgraphics.recipes.suitable import suggestion
-from invgraphics.runs import checkpoint
 from invgraphics.runs.environment import Environment
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import TRUTH, RunFolder
@@ -96,9 +95,10 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         check_variants(job.variants, [method], scene)
         training_scene = make_training_scene(job, scene)
         identity = run_digest(job, truth_digest(scene), torch.get_num_threads())
-        same = folder.identity == identity
+        same, other_code = folder.identity == identity, ""
         if request.existing == "resume" and folder.identity and not same:
-            raise other_run(folder, method.name)
+            check_resumable(job, scene, training_scene)
+            other_code, same = earlier_code(job), True
         if same and folder.finished:
             for protocol in job.unscored():
                 evaluate_saved(folder, scene, protocol)
@@ -109,7 +109,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         with PeakMemory(job.device) as memory:
             fit = prepare(job, training_scene, scene)
             resumed = same and folder.resumable
-            earlier = _resumed(fit, job) if resumed else None
+            earlier = resume(fit, job) if resumed else None
             forecast = warm_up(fit, method, memory)  # which may refuse: the folder is as it was until then
             if earlier is not None:
                 memory.include(earlier.peak_memory_bytes or 0)
@@ -118,6 +118,8 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
             else:
                 folder.clear()
             before = folder.read(Environment) if earlier is not None and folder.has(Environment) else None
+            if before is not None and other_code:
+                before = begun_by(before, other_code)
             described = write_description(job, scene, training_scene, identity, fit.plan, before)
             folder.write(replace(described, memory_forecast_bytes=forecast.bytes))
             if "inconsistent_poses" in scene.notes:
@@ -133,21 +135,6 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         _declare_clocks(folder, spent)
         _evaluate(job, scene, fit, spent)
         render_missing(job, scene)
-
-
-def _resumed(fit: Fit, job: Job) -> FitRecord:
-    """Load the folder's checkpoint into the fit, with the clocks at that moment; returns the record of the time before.
-
-    Checkpoint and clocks are two files: of a fit that was killed between them, the clocks are those of the checkpoint before.
-    """
-    state, known = checkpoint.load(job.folder.checkpoint, job.device), job.folder.read(FitRecord)
-    earlier = at_step(known, int(state["fit"]["steps"]))
-    if earlier is not known:
-        lost = f"steps {known.steps} to {earlier.steps} of {job.folder.root}, which was killed as it wrote a checkpoint"
-        warn(f"Warning: the times of {lost}, are not known; they count at the mean rate of the steps before.")
-    fit.load(state, earlier.seconds or 0.0)
-    fit.resume_clocks(asdict(earlier))
-    return earlier
 
 
 def prepare(job: Job, training_scene: Scene, scene: Scene) -> Fit:
@@ -273,6 +260,14 @@ def _relative(target: Path, start: Path) -> tuple[str, ...]:
     return Path(os.path.relpath(target, start)).parts
 
 
+def _words(error: Exception) -> str:
+    """An error in words: its own, of those that are written for users; else its kind and, where a plug-in raised it, which."""
+    if isinstance(error, InputError | NumericalError):
+        return str(error)
+    what, fault = plugins.unexpected(error)
+    return f"{what} ({fault[0].lower()}{fault[1:]})"
+
+
 def work(job: Path) -> int:
     """Run the fit of a JSON job file in this process; returns its exit status (see `executors.local`)."""
     try:
@@ -284,7 +279,7 @@ def work(job: Path) -> int:
             return INTERRUPTED
         fault = file_fault(error) or error
         with suppress(InputError, OSError):  # the disk that is full may be this one, and the folder that may not be written
-            write_json(job.with_suffix(".error.json"), {"kind": type(fault).__name__, "error": str(fault)})
+            write_json(job.with_suffix(".error.json"), {"kind": type(fault).__name__, "error": _words(fault)})
         if not isinstance(fault, InputError):
             traceback.print_exc()
         return 1

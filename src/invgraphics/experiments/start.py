@@ -1,9 +1,9 @@
-"""What comes before a fit: initialisation from another run, checks of folder and losses, the forecast of its peak memory."""
+"""What comes before a fit: initialisation from a run or a checkpoint, checks of folder and losses, forecast of peak memory."""
 
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -11,7 +11,9 @@ import torch
 from invgraphics import locks
 from invgraphics.core import Field, RayRenderer, Scene
 from invgraphics.errors import InputError
+from invgraphics.experiments.clocks import at_step
 from invgraphics.experiments.fitted import load_fitted
+from invgraphics.experiments.job import Job
 from invgraphics.experiments.memory_check import COPIES, RAY_BYTES, TRAINED_COPIES, upsampled_bytes
 from invgraphics.experiments.progress import warn
 from invgraphics.fields.mesh import MeshFieldConfig
@@ -19,6 +21,8 @@ from invgraphics.formats.mesh import mesh_from_file
 from invgraphics.memory import total_bytes
 from invgraphics.metrics.cost import model_bytes
 from invgraphics.recipes.recipe import Method
+from invgraphics.runs import checkpoint
+from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.provenance import Provenance
 from invgraphics.training.batches import Batches, size_of
@@ -54,6 +58,30 @@ def check_source(method: Method, scene_spec: str) -> None:
     shown = RunFolder(Path(source)).read(Provenance).scene
     if Path(shown).resolve() != Path(scene_spec).resolve():
         raise InputError(f"field.source: {source} is a run on '{shown}', not on '{scene_spec}'.")
+
+
+def resume(fit: Fit, job: Job) -> FitRecord:
+    """Load the folder's checkpoint into the fit, with the clocks at that moment; returns the record of the time before.
+
+    Checkpoint and clocks are two files: of a fit that was killed between them, the clocks are those of the checkpoint before.
+
+    Raises:
+        InputError: the checkpoint, of earlier code, does not fit today's model.
+    """
+    state, known = checkpoint.load(job.folder.checkpoint, job.device), job.folder.read(FitRecord)
+    earlier = at_step(known, int(state["fit"]["steps"]))
+    if earlier is not known:
+        lost = f"steps {known.steps} to {earlier.steps} of {job.folder.root}, which was killed as it wrote a checkpoint"
+        warn(f"Warning: the times of {lost}, are not known; they count at the mean rate of the steps before.")
+    try:
+        fit.load(state, earlier.seconds or 0.0)
+    except (RuntimeError, KeyError, ValueError) as error:
+        if not job.request.keep:
+            raise
+        cause = " ".join(str(error).split())
+        raise InputError(f"The checkpoint in {job.folder.root} does not fit the code of today: {cause}.") from error
+    fit.resume_clocks(asdict(earlier))
+    return earlier
 
 
 def remove_empty(folder: Path) -> None:

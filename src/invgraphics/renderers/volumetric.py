@@ -203,7 +203,7 @@ def query(field: Field, samples: Samples, want: Quantity, chunk: int) -> FieldVa
     """Query a field in chunks of at most ``chunk`` samples, which bounds the memory of its activations.
 
     Raises:
-        InputError: the field returns values of wrong shapes, or none of what is wanted.
+        InputError: the field returns values of wrong shapes or types, or none of what is wanted.
     """
     if len(samples) <= chunk:
         return _checked(field, samples, want)
@@ -220,8 +220,10 @@ _COLUMNS = {"density": (), "sdf": (), "gradient": (3,), "radiance": (3,), "norma
 
 
 def _checked(field: Field, samples: Samples, want: Quantity) -> FieldValues:
-    """Query a field whose author may have mistaken a shape: kernels and indices further on would not say so."""
-    values = field.query(samples, want)
+    """Query a field whose author may have mistaken a shape or type: kernels and indices further on would not say so."""
+    values: object = field.query(samples, want)
+    if not isinstance(values, FieldValues):
+        raise InputError(f"{type(field).__name__}.query returned {type(values).__name__}, no FieldValues.")
     for name, columns in _COLUMNS.items():
         value, expected = getattr(values, name), (len(samples), *columns)
         if value is None and name != "normal" and Quantity[name.upper()] in want:
@@ -229,4 +231,6 @@ def _checked(field: Field, samples: Samples, want: Quantity) -> FieldValues:
         if value is not None and tuple(value.shape) != expected:
             sentence = f"{type(field).__name__}.query returned {name} of shape {tuple(value.shape)} for {len(samples)} samples."
             raise InputError(sentence, f"Expected: {expected}.")
+        if value is not None and not value.is_floating_point():
+            raise InputError(f"{type(field).__name__}.query returned {name} of type {value.dtype}, no floating-point numbers.")
     return values

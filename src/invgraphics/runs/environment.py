@@ -28,7 +28,7 @@ class Environment(Record):
         packages: name -> version; ``None`` where it is not installed.
         gpu: its name.
         note: what limits repeatability, a sentence.
-        begun_on: machines and packages of earlier parts of a fit, where it was resumed with others.
+        begun_on: machines and packages of earlier parts of a fit, or their code, where it was resumed with others.
         executor: of a study: what ran its fits.
         jobs: of a study: fits that shared the machine.
     """

@@ -18,6 +18,7 @@ subject        (n,) integers, optional        of a class of objects: which one e
 observed       (n,) booleans, optional        of a class: views from which the unseen instances are inferred
 bounds         (2, 3), optional               lowest and highest corner of a box that holds all there is; default: unbounded
 own_units      () boolean, optional           whether the box is taken as it is, however large; default: scaled to a usual size
+name           () text, optional              of the scene, at most 100 characters; default: the file's
 ============== ============================== =====================================================================
 """
 
@@ -37,7 +38,6 @@ from invgraphics.arrays import read_arrays
 from invgraphics.core import Bounds, Camera, Points, Scene, View
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError, did_you_mean
-from invgraphics.files import write_arrays
 from invgraphics.scenes.border import background_of, looked_at
 from invgraphics.scenes.layout import HOLD_OUT, SceneOptions, evenly, local_points
 from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
@@ -46,6 +46,8 @@ from invgraphics.scenes.poses import poses
 from invgraphics.scenes.region import LocalFrame, box_frame, contracted_frame, object_frame
 
 Arrays = Mapping[str, np.ndarray]
+MOST_CHARACTERS = 100
+"""Of a scene's name."""
 _REQUIRED = ("images", "cam_to_world", "focal")
 
 
@@ -83,7 +85,7 @@ class Npz:
         named = list(zip(_cameras(arrays, local), _names(arrays), strict=True))
         views = {i: _view(path, arrays, i, named[i], frame, final) for part in chosen for i in part}
         return Scene(
-            name=path.stem,
+            name=_scene_name(arrays, path),
             train=tuple(views[i] for i in chosen[0]),
             val=tuple(views[i] for i in val),
             test=tuple(views[i] for i in chosen[2]),
@@ -119,6 +121,7 @@ def _read(path: Path) -> Arrays:
         "subject": [(n,)],
         "observed": [(n,)],
         "own_units": [()],
+        "name": [()],
     }
     known = (*_REQUIRED, *allowed, "points", "points_rgb")
     if unknown := [key for key in arrays if key not in known]:
@@ -127,7 +130,7 @@ def _read(path: Path) -> Arrays:
         if key in arrays and arrays[key].shape not in shapes:
             expected = " or ".join(map(str, shapes))
             raise InputError(f"'{key}' of {path} has shape {arrays[key].shape}, expected {expected}.")
-        if key in arrays and arrays[key].dtype.kind not in "fiub":
+        if key in arrays and key != "name" and arrays[key].dtype.kind not in "fiub":
             raise InputError(f"'{key}' of {path} holds {arrays[key].dtype}, not numbers.")
     if (alpha := arrays.get("alpha")) is not None and alpha.dtype == np.uint8 and alpha.max(initial=0) == 1:  # 0, 1 are meant
         arrays["alpha"] = alpha * np.uint8(255)
@@ -198,6 +201,16 @@ def _cameras(arrays: Arrays, poses: Float[Tensor, "n 4 4"]) -> list[Camera]:
     return [Camera(pose, focal, middle, width, height) for pose, focal, middle in zip(poses, *lens, strict=True)]
 
 
+def _scene_name(arrays: Arrays, path: Path) -> str:
+    """Name of the scene in a file: its key, else that of the file."""
+    if "name" not in arrays:
+        return path.stem
+    name = str(arrays["name"])
+    if arrays["name"].dtype.kind != "U" or not name.isprintable() or not 0 < len(name) <= MOST_CHARACTERS:
+        raise InputError(f"'name' of {path} is no text of 1 to {MOST_CHARACTERS} printable characters.")
+    return name
+
+
 def _names(arrays: Arrays) -> list[str]:
     """A view's index; of a class, its subject and its place among that subject's views."""
     if "subject" not in arrays:
@@ -236,65 +249,3 @@ def _bytes(values: np.ndarray, key: str, path: Path) -> UInt8[np.ndarray, "*shap
     if values.dtype.kind == "f" and np.isfinite(values).all() and (values >= 0).all() and (values <= 1).all():
         return (values * 255 + 0.5).astype(np.uint8)
     raise InputError(f"'{key}' of {path} holds neither bytes nor finite floats in [0, 1].")
-
-
-def save_npz(scene: Scene, path: Path) -> None:
-    """Write a scene as one ``.npz`` file that `Npz` reads as the same scene, in the same units; colours of points have 8 bits.
-
-    Not kept: names of views, spread of exposures, noise level, and which photographs show which points.
-
-    Raises:
-        InputError: it holds what the convention does not: no box, linear or unrounded colours, masks, another
-            background, pictures of several sizes; the sentence says what. Nothing is written then.
-    """
-    if beyond := unsupported_parts(scene):
-        raise InputError(
-            f"The scene '{scene.name}' cannot be kept as a data set: it has {beyond}.",
-            "Write it in a format that `load_scene` reads, and load it from there.",
-        )
-    views = [*scene.train, *scene.val, *scene.test, *scene.observed]
-    ends = np.cumsum([len(split) for split in (scene.train, scene.val, scene.test, scene.observed)])
-    split = np.searchsorted(ends, np.arange(len(views)), side="right")
-    arrays: dict[str, np.ndarray] = {
-        "images": np.stack([view.image.cpu().numpy() for view in views]),
-        "cam_to_world": np.stack([view.camera.cam_to_world.cpu().numpy() for view in views]),
-        "focal": np.stack([view.camera.focal.cpu().numpy() for view in views]),
-        "centre": np.stack([view.camera.principal_point.cpu().numpy() for view in views]),
-        "test": split == 2,
-        "bounds": torch.stack([scene.bounds.lo, scene.bounds.hi]).cpu().numpy(),
-        "own_units": np.array(True),
-    }
-    for key in ("alpha", "depth", "normal"):
-        values = [getattr(view, key) for view in views]
-        if all(value is not None for value in values):
-            arrays[key] = np.stack([value.cpu().numpy() for value in values])
-    arrays |= {"val": split == 1} if scene.val else {}
-    if scene.is_class:
-        arrays |= {"subject": np.array([view.subject for view in views]), "observed": split == 3}
-    if scene.points is not None:
-        arrays |= {"points": scene.points.position.cpu().numpy(), "points_rgb": scene.points.rgb.clamp(0, 1).cpu().numpy()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_arrays(path, arrays)
-
-
-def unsupported_parts(scene: Scene) -> str:
-    """List what a scene has that the format cannot store, in words; empty for nothing."""
-    views = [*scene.train, *scene.val, *scene.test, *scene.observed]
-    cameras = [view.camera for view in views]
-    mixed = [key for key in ("alpha", "depth", "normal") if len({getattr(view, key) is None for view in views}) > 1]
-    found = {
-        "no box around it": scene.bounds.space != "box",
-        "a near distance of its own": scene.bounds.near != Bounds.near,
-        "a frame of its own": not torch.equal(scene.world_from_local, torch.eye(4)),
-        "linear colours": scene.colour != "srgb",
-        "colours or an alpha that are not bytes": any(
-            values.dtype != torch.uint8 for view in views for values in (view.image, view.alpha) if values is not None
-        ),
-        "masks": any(view.mask is not None for view in views),
-        "a mesh": scene.mesh is not None,
-        f"{' and '.join(mixed)} for some views only": bool(mixed),
-        "pictures of several sizes": len({(camera.width, camera.height) for camera in cameras}) > 1,
-        "a background other than the default": not torch.equal(scene.background, background_of(views)),
-        "poses that are degraded on purpose": any(view.ground_truth_pose is not None for view in views),
-    }
-    return next((what for what, present in found.items() if present), "")

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError, did_you_mean
-from invgraphics.scenes.layout import SceneOptions
+from invgraphics.scenes.layout import SceneOptions, evenly
 from invgraphics.scenes.pictures.images import image_files
 from invgraphics.scenes.validation import validate
 
@@ -107,7 +107,7 @@ def _load(spec: str, options: SceneOptions, progress: Callable[[int, int, str], 
         )
     if options.spp is not None:
         raise InputError(f"{path} holds pictures, whose samples per pixel are what they are.", "Leave out --spp.")
-    return find_loader(path).load(path, options)
+    return _loaded(find_loader(path), path, options)
 
 
 def find_loader(path: Path) -> Loader:
@@ -116,9 +116,9 @@ def find_loader(path: Path) -> Loader:
     Raises:
         InputError: none fits; the sentence says what was looked for.
     """
-    for _, kind in plugins.load_all("scenes"):
+    for name, kind in plugins.load_all("scenes"):
         loader: Loader = kind()
-        if loader.matches(path):
+        if _matches(loader, name, path):
             return loader
     if image_files(path):
         raise InputError(
@@ -130,6 +130,37 @@ def find_loader(path: Path) -> Loader:
         "Looked for truth.json, transforms_train.json, transforms.json, poses_bounds.npy, sparse/0/cameras.bin, cameras*.npz "
         f"and .npz (formats: {', '.join(plugins.names('scenes'))}).",
     )
+
+
+def _matches(loader: Loader, name: str, path: Path) -> bool:
+    """Whether a loader recognises a path; a third-party one that fails at it is left out, with a warning."""
+    try:
+        return loader.matches(path)
+    except Exception as error:  # it may raise anything, and another format may be the right one
+        if (source := plugins.origin("scenes", name)) == "built in":
+            raise
+        plugins.leave_out(f"'{name}' of the scenes ({source}) cannot tell whether it knows {path}: {error!r}.")
+        return False
+
+
+def _loaded(loader: Loader, path: Path, options: SceneOptions) -> Scene:
+    """Load a data set; of a third-party loader, check what it returns, and choose the test views if it has not.
+
+    Raises:
+        InputError: the loader returned no scene, or pictures of another size than was asked for.
+    """
+    if type(loader).__module__.partition(".")[0] == "invgraphics":
+        return loader.load(path, options)
+    scene: object = loader.load(path, options)
+    who = f"{type(loader).__module__}.{type(loader).__name__}.load"
+    if not isinstance(scene, Scene):
+        raise InputError(f"{who} returned {type(scene).__name__}, no Scene.", "See docs/extending.md.")
+    sizes = {(view.camera.width, view.camera.height) for view in (*scene.train, *scene.val, *scene.test)}
+    if sizes and options.size is not None and options.size not in (max(map(max, sizes)), *sizes):
+        found = ", ".join(f"{width}x{height}" for width, height in sorted(sizes)[:3])
+        asked = options.size if isinstance(options.size, int) else "{}x{}".format(*options.size)
+        raise InputError(f"{who} returned pictures of {found} pixels, though --size asks for {asked}.")
+    return replace(scene, test=tuple(evenly(scene.test, options.test_views)))
 
 
 def missing_data_reason(spec: str) -> str:

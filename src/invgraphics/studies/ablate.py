@@ -16,6 +16,7 @@ from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
+from invgraphics.experiments.compare_folders import warn_of_replaced
 from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.identity import check_replaceable, run_digest, truth_digest
 from invgraphics.experiments.job import Job
@@ -98,6 +99,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
                 states[name] = CellState("done")
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
         _check_threads(missing, threads)
+        warn_of_replaced(sum(_is_replaced(planned, truths[_truth_key(planned)], threads) for planned in missing))
         costs = _try_methods(missing, trials)
         missing.sort(key=lambda planned: _execution_order(planned, study, costs))
         expected = {planned.id: costs[_cost_key(planned)].seconds(planned.job.budget) for planned in missing}
@@ -174,6 +176,12 @@ def _is_finished(planned: Planned, truth: str, threads: int) -> bool:
     run = planned.job.folder
     same = run.finished and run.identity == run_digest(planned.job, truth, threads)
     return same and renderings_complete(planned.job)
+
+
+def _is_replaced(planned: Planned, truth: str, threads: int) -> bool:
+    """Whether a finished run of other code or pictures is in a cell's place."""
+    run = planned.job.folder
+    return run.finished and run.identity != run_digest(planned.job, truth, threads)
 
 
 def _check_threads(missing: Sequence[Planned], threads: int) -> None:

@@ -95,7 +95,7 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     if Quantity.GAUSSIANS not in fitted.model.field.provides:
         raise InputError(
             f"The model of '{request.run}' ({fitted.method.name}) has no Gaussians to write as {request.to}.",
-            "Runs of splatting methods have some.",
+            f"Runs of splatting methods have some; or make them: invgraphics convert {request.run} --to gaussians --out RUN.",
         )
     scene = fitted.scene
     axes = plugins.load("formats", request.to).axes

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from invgraphics.core import Batch, Bounds, Context, Field, Quantity, Renderer, Rendering, Samples, Trace
 from invgraphics.errors import InputError
-from invgraphics.training.requirement import Requirement
+from invgraphics.training.checks import Requirement
 
 DISTANCE = Requirement("a signed distance", quantities=Quantity.SDF | Quantity.GRADIENT)
 """For penalties that need a signed distance."""

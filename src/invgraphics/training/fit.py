@@ -19,6 +19,7 @@ from invgraphics.kernels.allocator import keep_freed_memory
 from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
+from invgraphics.training.checks import check_results, check_term, check_values
 from invgraphics.training.clock import SchedulerTimes, SpeedProbe
 from invgraphics.training.hooks import FitState, Hook, generator_state, load_prefixed, prefixed
 from invgraphics.training.losses import Loss
@@ -143,11 +144,13 @@ class Fit:
         for hook in plan.hooks:
             hook.before_step(state)
         rendering, trace, batch = self._render(ctx)
+        if self.steps == 0:
+            check_values(rendering, trace, batch, plan.model)
         composited = _mask_rendering(replace(rendering, rgb=rendering.over(batch.background)), batch)
-        objective = (*plan.losses, *plan.penalties)
-        losses = [loss(composited, trace, batch, ctx) for loss in plan.losses]
-        losses += [penalty(plan.model.field, plan.model.renderer, ctx) for penalty in plan.penalties]
-        terms = torch.stack([_checked_term(value, term) for value, term in zip(losses, objective, strict=True)])
+        losses = [check_term(loss(composited, trace, batch, ctx), loss, "loss") for loss in plan.losses]
+        parts = plan.model.field, plan.model.renderer, ctx
+        losses += [check_term(penalty(*parts), penalty, "penalty") for penalty in plan.penalties]
+        terms = torch.stack(losses)
         if self.steps == 0:
             idle = (index for index, value in enumerate(losses[: len(plan.losses)]) if not value.requires_grad)
             self.idle_losses = tuple(idle)
@@ -190,12 +193,12 @@ class Fit:
         if isinstance(renderer, RayRenderer):
             rays, batch = self._batches.rays(ctx.progress)
             views = rays.view
-            rendering, trace = renderer.render_rays(fitted, rays, ctx)
+            rendering, trace = check_results(renderer.render_rays(fitted, rays, ctx), renderer)
             self._batches.observe(0 if trace.samples is None else len(trace.samples))
         else:
             camera, batch = self._batches.image(ctx.progress)
             views = batch.view
-            rendering, trace = renderer.render_image(fitted, camera, ctx)
+            rendering, trace = check_results(renderer.render_image(fitted, camera, ctx), renderer)
         if exposures is not None:
             rendering, trace = exposures.expose(rendering, trace, views)
         return rendering, trace, batch
@@ -285,14 +288,6 @@ def _mask_rendering(rendering: Rendering, batch: Batch) -> Rendering:
         return rendering
     rgb = torch.where(batch.mask[..., None], rendering.rgb, batch.target)
     return replace(rendering, rgb=rgb, alpha=torch.where(batch.mask, rendering.alpha, batch.alpha))
-
-
-def _checked_term(value: Tensor, term: Loss | Penalty) -> Tensor:
-    """Check that a loss or penalty returned one number, as a tensor."""
-    if not isinstance(value, Tensor) or value.ndim:
-        what = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
-        raise InputError(f"The loss {_name(term)} returned {what}.", "Expected: a tensor without dimensions, as of mean().")
-    return value
 
 
 def _name(part: object) -> str:

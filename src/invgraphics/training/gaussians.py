@@ -7,7 +7,7 @@ from typing import Protocol
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.training.requirement import Requirement
+from invgraphics.training.checks import Requirement
 
 
 class GaussianParameters(Protocol):

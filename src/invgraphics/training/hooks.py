@@ -10,8 +10,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Batch, Camera, Context, Field, Renderer, Rendering, Scene, Trace
+from invgraphics.training.checks import Requirement
 from invgraphics.training.optimiser import Optimiser
-from invgraphics.training.requirement import Requirement
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -110,7 +110,7 @@ class Optimiser:
         unused = [str(group["name"]) for group in groups if not group["params"]]
         if unused:
             first = config.groups[unused[0]].match
-            known = ", ".join(sorted(parameters))
+            known = ", ".join(sorted(parameters)) or "none: field and renderer learn nothing"
             raise InputError(f"'optimiser.groups.{unused[0]}' matches no parameter ('{first}').", f"Parameters: {known}.")
         betas = (config.beta1, config.beta2)
         dense = [group for group in groups if not config.groups[str(group["name"])].skip_zero]

@@ -14,7 +14,7 @@ from torch import Tensor
 from invgraphics.core import Context, Field, Quantity, Renderer, Samples
 from invgraphics.core.lattice import Lattice, LatticeField, Role
 from invgraphics.errors import InputError
-from invgraphics.training.requirement import Requirement
+from invgraphics.training.checks import Requirement
 
 Penalty = Callable[[Field, Renderer, Context], Tensor]
 """A term of the objective that depends on the model alone. Randomness comes from the context's generator."""

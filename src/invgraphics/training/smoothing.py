@@ -12,8 +12,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from invgraphics.core import Camera
+from invgraphics.training.checks import Requirement
 from invgraphics.training.hooks import FitState, Hook
-from invgraphics.training.requirement import Requirement
 
 CHUNK = 4096
 """Points that are projected into all cameras at once: few enough for the cache."""

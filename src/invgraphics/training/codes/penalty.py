@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core import Conditional, Context, Field, Renderer
-from invgraphics.training.requirement import Requirement
+from invgraphics.training.checks import Requirement
 
 
 class HasCodes(Protocol):

@@ -14,10 +14,10 @@ from invgraphics.core import Context, Field, RayRenderer, Renderer
 from invgraphics.errors import InputError
 from invgraphics.kernels.near import near_points
 from invgraphics.renderers.quadrature import heaviest_of_rays
+from invgraphics.training.checks import Requirement
 from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.prune import trace_random_rays
-from invgraphics.training.requirement import Requirement
 from invgraphics.training.rows import replace_rows
 
 NEIGHBOURS = 4
