@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from invgraphics.core import Rendering as Rendering
     from invgraphics.core import Scene as Scene
     from invgraphics.core import View as View
+    from invgraphics.plugins import register as register
 
 __all__ = [
     "Camera",
@@ -47,6 +48,7 @@ __all__ = [
     "load_run",
     "load_scene",
     "load_study",
+    "register",
     "save_scene",
 ]
 
@@ -65,6 +67,7 @@ _HOMES = {
     "load_run": "invgraphics.api",
     "load_scene": "invgraphics.api",
     "load_study": "invgraphics.api",
+    "register": "invgraphics.plugins",
     "save_scene": "invgraphics.api",
 }
 """Public name -> the module that has it."""

@@ -8,6 +8,7 @@ from invgraphics import plugins
 from invgraphics.cli import main
 from invgraphics.errors import InputError
 from invgraphics.fields.neural import NeuralFieldConfig
+from invgraphics.plugins.registries import own
 from invgraphics.recipes.recipe import expand, load_method, source
 from invgraphics.scenes.open import find_loader
 
@@ -73,7 +74,7 @@ def test_a_name_that_a_built_in_has_is_left_out_with_a_line(
     (info / "entry_points.txt").write_text(TAKEN_NAMES)
     monkeypatch.syspath_prepend(tmp_path)
     plugins.leave_out.cache_clear()
-    assert plugins.names("fields")["gaussians"] == plugins._own("fields")["gaussians"] and not plugins.names("recipes")
+    assert plugins.names("fields")["gaussians"] == own("fields")["gaussians"] and not plugins.names("recipes")
     assert load_method("volumetric/nerf").name == "volumetric/nerf"
     assert {plugins.origin("fields", "gaussians"), plugins.origin("recipes", "volumetric/nerf")} == {"built in"}
     assert not plugins.used_plugins({"field": {"type": "gaussians"}}, "volumetric/nerf")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 
+from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, open_with_progress
@@ -181,6 +182,7 @@ def _suitable(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> tup
     kept, refused = [], []
     for job in jobs:
         try:
+            plugins.check_importable(job.method.table, job.method.name)
             check_source(job.method, request.scene)
             build_model(job.method, scene, request.seeds[0], job.device)
         except InputError as error:

@@ -147,4 +147,6 @@ def _method(folder: RunFolder, provenance: Provenance) -> Method:
             raise
         names = ", ".join(f"'{name}'" for name, package in used.items() if package in missing)
         sentence = f"{folder.root} was made with {', '.join(missing)}, which provides {names} and is not installed here."
-        raise InputError(sentence, "Install the package into this environment.") from error
+        modules = ",".join(package.removeprefix("module ") for package in missing if package.startswith("module "))
+        remedy = f"Set INVGRAPHICS_MODULES={modules} where it can be imported." if modules else "Install the package here."
+        raise InputError(sentence, remedy) from error

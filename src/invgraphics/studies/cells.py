@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from invgraphics import plugins
 from invgraphics.errors import InputError
 from invgraphics.experiments.identity import cell_digest
 from invgraphics.experiments.job import Job
@@ -74,6 +75,7 @@ def make_plan(study: Study, request: AblateRequest) -> list[Planned]:
         key = (cell.method, fit.preset, fit.budget, fit.recipe_overrides)
         try:
             job = Job.of(fit, methods.get(key))
+            plugins.check_importable(job.method.table, job.method.name)
         except InputError as error:
             raise _in_cell(cell, error) from error
         methods[key] = job.method

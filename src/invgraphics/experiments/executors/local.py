@@ -13,6 +13,7 @@ from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
+from invgraphics import plugins
 from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.request import FitRequest
@@ -51,7 +52,7 @@ class FitProcess:
             stdin=subprocess.PIPE,
             stdout=self._log,
             stderr=self._log,
-            env=os.environ | pinned,
+            env=os.environ | plugins.environment() | pinned,
         )
 
     def wait(self) -> Outcome:

@@ -11,6 +11,7 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
+from invgraphics import plugins
 from invgraphics.errors import InputError
 from invgraphics.experiments.executors.base import Outcome, Resources
 from invgraphics.experiments.executors.local import FitProcess
@@ -51,6 +52,7 @@ class RayExecutor:
                 max_retries=RETRIES,
                 retry_exceptions=[StoppedError],
                 name="invgraphics fit",
+                runtime_env={"env_vars": plugins.environment()},
             )
             folder = str(Path.cwd())
             waiting = {task.remote(request, str(jobs), self._resources, folder): request for request in requests}
