@@ -88,3 +88,23 @@ def test_depth_is_found_where_the_near_plane_is_the_camera() -> None:
     camera = Camera(pose, torch.tensor([8.0, 8.0]), torch.tensor([4.0, 4.0]), 8, 8)
     bounds = Bounds(-torch.ones(3), torch.ones(3), "contracted", near=0.0)
     assert float(field_depth(Sphere(50.0, 0.5), camera, bounds)[4, 4]) == pytest.approx(2.55, abs=0.15)
+
+
+def test_what_a_depth_camera_has_not_measured_is_no_surface(scene) -> None:
+    """It writes 0 there, which would be a point at the camera."""
+    zeros = [replace(view, depth=torch.where(view.depth.isfinite(), view.depth, 0.0)) for view in scene.train]
+    points = depth_points(scene.with_views(train=tuple(zeros)), 500)
+    assert float((surface_distance(points.position).abs() < 0.1).float().mean()) > 0.9
+    nothing = [replace(view, depth=torch.zeros_like(view.depth)) for view in scene.train]
+    with pytest.raises(InputError, match="no depth maps"):
+        depth_points(scene.with_views(train=tuple(nothing)), 500)
+
+
+def test_no_point_is_seen_through_masked_pixels(scene) -> None:
+    """All cameras but one are masked out, and that shows its left half only: all points are there."""
+    left = torch.zeros(32, 32, dtype=torch.bool)
+    left[:, :16] = True
+    shown = scene.with_views(train=(replace(scene.train[0], mask=left),))
+    points = visible_points(TwoBalls(), shown, 500)
+    pixels, _ = shown.train[0].camera.project(points.position)
+    assert bool((pixels[:, 0] < 16).all())

@@ -1,6 +1,7 @@
 """The trivial predictions on toy scenes whose answer is known."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -78,3 +79,14 @@ def test_no_training_views_is_said() -> None:
     scene = scene_of((), (view_at(0.0, 0.5),))
     with pytest.raises(InputError, match="no training views"):
         baselines.baseline_scores(scene, PROTOCOLS["default"])
+
+
+def test_the_mean_is_over_pixels_that_masks_leave() -> None:
+    half = torch.zeros(12, 16, dtype=torch.bool)
+    half[:, :8] = True
+    train = (replace(view_at(0.0, 0.2), mask=half), view_at(1.0, 0.8))
+    (picture,) = baselines.mean_image(scene_of(train, (view_at(2.0, 0.6),)))
+    torch.testing.assert_close(picture.rgb[:, :8], torch.full((12, 8, 3), 0.5), atol=2e-3, rtol=0)
+    torch.testing.assert_close(picture.rgb[:, 8:], torch.full((12, 8, 3), 0.8), atol=2e-3, rtol=0)
+    (large,) = baselines.mean_image(scene_of(train, (view_at(2.0, 0.6, size=(24, 32)),)))
+    assert [float(large.rgb[0, x, 0]) for x in (0, -1)] == pytest.approx([0.5, 0.8], abs=2e-3)

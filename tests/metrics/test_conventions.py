@@ -75,12 +75,13 @@ def scored(name: str) -> dict[str, float]:
     return {metric: entry.mean for metric, entry in quality.items()}
 
 
-def composited(background: tuple, dtype: type = np.float64) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Unrounded prediction and truth over a colour, the truth with the tool's precision."""
+def composited(background: tuple, dtype: type = np.float64, opaque: bool = False) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Unrounded prediction and truth over a colour, the truth with the tool's precision; or, ``opaque``, without its alpha."""
     result = []
     for rgb, coverage, truth, alpha in SET:
         behind, opacity = np.asarray(background, dtype), alpha[..., None].astype(dtype) / dtype(255)
         true_colour = truth.astype(dtype) / dtype(255) * opacity + (1 - opacity) * behind
+        true_colour = truth / 255 if opaque else true_colour
         result.append((rgb + (1 - coverage[..., None]) * np.asarray(background), true_colour))
     return result
 
@@ -166,7 +167,7 @@ def test_a_convention_is_that_of_an_independent_implementation(name: str) -> Non
     background, of_image, of_truth, metrics = ROUTES[name]
     pairs = [
         (of_image(image) if of_image else image, of_truth(truth) if of_truth else truth)
-        for image, truth in composited(background, np.float32 if name == "nerfbaselines" else np.float64)
+        for image, truth in composited(background, np.float32 if name == "nerfbaselines" else np.float64, name == "gsplat")
     ]
     got = scored(name)
     for metric, function in metrics.items():
@@ -210,6 +211,9 @@ def test_linear_scenes_are_composited_linearly_and_compared_in_srgb() -> None:
     image, truth = shown(rendering, linear, scene("linear"), PROTOCOLS["nerf-pytorch"])
     torch.testing.assert_close(image, linear_to_srgb(rendering.over(torch.ones(3))))
     torch.testing.assert_close(truth, linear_to_srgb(linear.over(torch.ones(3))))
+    clear = Rendering(torch.zeros(HEIGHT, WIDTH, 3), torch.zeros(HEIGHT, WIDTH), torch.zeros(HEIGHT, WIDTH))
+    image, _ = shown(clear, linear, scene("linear"), PROTOCOLS["nerfstudio-splatfacto"])
+    torch.testing.assert_close(image, torch.tensor(VISER_GREY).expand_as(image))  # as the viewer displays it
 
 
 def test_masks_are_those_of_the_tool() -> None:

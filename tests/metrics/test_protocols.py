@@ -192,7 +192,7 @@ class Point:
 def test_a_third_party_metric_is_scored_and_cannot_spoil_the_others(monkeypatch) -> None:
     points = [Point("bias", "BIAS"), Point("faulty", "FAULTY"), Point("gone", "ABSENT"), Point("odd", "HEIGHT")]
     points.append(Point("nothing", "NOTHING"))
-    monkeypatch.setattr(plugins, "_entry_points", lambda path: points)
+    monkeypatch.setattr("invgraphics.plugins.entry_points._entry_points", lambda path: points)
     view = view_of(0.25)
     result = score(rendering_of(0.5), view, scene_of(view), PLAIN)
     assert result.values["bias"] == pytest.approx(0.25)

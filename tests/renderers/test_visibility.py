@@ -11,7 +11,7 @@ from invgraphics.core import Bounds, Camera, Context, Scene
 from invgraphics.core.scene import Points
 from invgraphics.fields.analytic import Sphere
 from invgraphics.renderers.occupancy import OccupancyConfig
-from invgraphics.renderers.visibility import cells_near_points, visible_cells
+from invgraphics.renderers.visibility import cells_in_ball, cells_near_points, visible_cells
 
 
 def cell_of(bounds: Bounds, position: torch.Tensor, resolution: int) -> tuple[torch.Tensor, ...]:
@@ -64,3 +64,33 @@ def test_only_cells_near_points_are_sampled_until_others_have_proved_dense(make_
     sampler.update(field, Context(scene.bounds, progress=0.2, training=True))
     assert bool(sampler.occupied.all())
     assert bool(OccupancyConfig(resolution=8, points_until=0.1).build(make_scene("box")).occupied.all())  # without points
+
+
+def test_cells_of_the_ball_are_those_that_random_points_find() -> None:
+    points = torch.randn(1_000_000, 3)
+    points = 0.5 + 0.5 * torch.rand(len(points), 1) ** (1 / 3) * points / points.norm(dim=1, keepdim=True)
+    found = torch.zeros(12, 12, 12, dtype=torch.bool)
+    found[(points * 12).long().clamp(0, 11).unbind(dim=1)] = True
+    within = cells_in_ball(12)
+    assert bool((within | ~found).all())  # none that a point lies in is missing
+    assert int((within & ~found).sum()) < 0.04 * int(found.sum())  # corners that it only touches
+    assert float(within.float().mean()) < 0.75 and bool(within[6, 6, 6]) and not bool(within[0, 0, 0])
+
+
+def test_a_refresh_looks_only_where_rays_can_go(make_scene: Callable[..., Scene]) -> None:
+    scene, places = make_scene("contracted"), []
+
+    class Noted(Sphere):
+        def query(self, samples, want):
+            places.append(samples.position)
+            return super().query(samples, want)
+
+    for warmup in (1, 10**6):
+        sampler = OccupancyConfig(resolution=16, grace=0, warmup=warmup, every=1, cells=2000).build(scene)
+        places.clear()
+        for _ in range(3):
+            sampler.update(Noted(40.0, 0.6), Context(scene.bounds, training=True))
+        cell = (scene.bounds.to_unit(torch.cat(places)) * 16).long().clamp(0, 15)
+        assert sampler.visible is not None and float(sampler.visible.float().mean()) < 0.7
+        near_visible = torch.nn.functional.max_pool3d(sampler.visible[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
+        assert bool(near_visible[cell.unbind(dim=1)].all())  # points beyond the rim are pulled onto it

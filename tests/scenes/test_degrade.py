@@ -10,9 +10,11 @@ from PIL import Image
 
 from invgraphics.config import fill
 from invgraphics.core import Camera, Scene, View
+from invgraphics.core.colour import linear_to_srgb
 from invgraphics.errors import InputError
 from invgraphics.scenes.degrade import TrainingData, chosen_views, degrade
 from invgraphics.testing import toy_cameras
+from invgraphics.training.batches import BatchConfig, Batches
 
 EVERYTHING = TrainingData(train_views=5, size=12, pose_noise=2.0, photo_noise=0.1, exposure=0.5, background=(0.2, 0.4, 0.6))
 
@@ -180,3 +182,33 @@ def test_cameras_are_only_moved_by_pose_noise(scene: Scene) -> None:
 
     same = degrade(scene, TrainingData(photo_noise=0.1, exposure=0.1, background="white"), 0)
     assert all(a is b for a, b in zip(cameras(same), cameras(scene), strict=True))
+
+
+@pytest.mark.parametrize("data", [TrainingData(size=12), TrainingData(scales=(1, 2))])
+def test_a_mask_that_leaves_no_smaller_pixel_leaves_out_the_view(scene: Scene, data: TrainingData) -> None:
+    """Stripes of one pixel: no pixel of half the size is wholly valid."""
+    height, width = scene.train[0].image.shape[:2]
+    stripes = (torch.arange(width) % 2 == 0).expand(height, width)
+    masked = scene.with_views(train=(replace(scene.train[0], mask=stripes), *scene.train[1:3]))
+    damaged = degrade(masked, data, 0)
+    whole = len(masked.train) * (len(data.scales) - 1)
+    assert len(damaged.train) == whole + 2 and damaged.notes["blank_views"].startswith("1 smaller ones without a valid pixel")
+    Batches(BatchConfig(rays=64), damaged, torch.Generator(), torch.device("cpu")).rays(0.0)
+    if data.size is not None:
+        with pytest.raises(InputError, match="leave no pixel of any training view at this size"):
+            degrade(scene.with_views(train=masked.train[:1]), data, 0)
+
+
+def test_noisy_display_colours_stay_in_their_range(many: Scene) -> None:
+    white = [replace(view, image=torch.ones(4, 4, 3)) for view in many.train]
+    for colour, most in (("srgb", 1.0), ("linear", 1.5)):
+        damaged = degrade(replace(many, colour=colour, train=tuple(white)), TrainingData(photo_noise=0.2), 0)
+        highest = max(float(view.image.max()) for view in damaged.train)
+        assert highest == 1.0 if colour == "srgb" else highest > most
+
+
+def test_a_named_background_is_a_display_colour(scene: Scene) -> None:
+    for colour in ("srgb", "linear"):
+        found = degrade(replace(scene, colour=colour), TrainingData(background="grey"), 0).background
+        shown = linear_to_srgb(found) if colour == "linear" else found
+        torch.testing.assert_close(shown, torch.full((3,), 0.5))

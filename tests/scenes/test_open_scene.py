@@ -210,8 +210,8 @@ def test_plug_in_formats_are_asked_too(tmp_path: Path, monkeypatch) -> None:
         def load(self, path: Path, options: SceneOptions) -> Scene:
             return scene()
 
-    monkeypatch.setattr(plugins, "names", lambda registry: {"mine": "somewhere:Mine"})
-    monkeypatch.setattr(plugins, "load", lambda registry, name: Mine)
+    monkeypatch.setattr("invgraphics.plugins.registered._REGISTERED", {})
+    plugins.register("scenes", "mine", Mine)
     assert open_scene(str(tmp_path)).name == "toy"
 
 

@@ -186,3 +186,26 @@ def test_fields_without_lattices_are_refused(scene):
         Fit(plan).step()
     with pytest.raises(InputError, match="appearance"):
         Fit(replace(planned(scene), penalties=[TotalVariationPenalty(role="appearance")])).step()
+
+
+@pytest.mark.parametrize("space", ["box", "contracted"])
+def test_sparsity_looks_evenly_at_what_the_bounds_describe(space) -> None:
+    """In endless space the share of points within a radius of the contracted ball is its cube, as of a ball's volume."""
+    seen = []
+
+    class Noted(Grids):
+        def query(self, samples, want):
+            seen.append(samples.position)
+            return super().query(samples, want)
+
+    bounds = Bounds(BOX.lo, BOX.hi, space)
+    ctx = Context(bounds, training=True, generator=torch.Generator().manual_seed(0))
+    SparsityPenalty(points=20000)(Noted(density=1.0), NO_RENDERER, ctx)
+    unit = bounds.to_unit(seen[0]) - 0.5
+    radius = 2 * unit.norm(dim=1)
+    if space == "contracted":
+        for share in (0.25, 0.5, 0.8, 0.99):
+            assert float((radius < share).float().mean()) == pytest.approx(share**3, abs=0.01)
+        assert float(unit.mean(dim=0).abs().max()) < 0.01
+    else:
+        assert float((unit.abs() < 0.25).all(dim=1).float().mean()) == pytest.approx(0.125, abs=0.01)

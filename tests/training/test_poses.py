@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -343,3 +344,18 @@ def test_rays_of_hooks_begin_where_the_fitted_cameras_are(blobs: Scene) -> None:
 def test_image_scales_end_with_the_window(scales: tuple[float, ...], until: tuple[float, ...]) -> None:
     config = PosesConfig(resolution=scales, window=(0.1, 0.5)).batches(BatchConfig())
     assert config.resolution == scales and config.until == pytest.approx(until)
+
+
+def test_hooks_trace_no_rays_through_masked_pixels(blobs: Scene) -> None:
+    """Nothing is fitted to what they would see."""
+    size = blobs.train[0].camera.width
+    left = torch.zeros(blobs.train[0].camera.height, size, dtype=torch.bool)
+    left[:, : size // 4] = True
+    masked = blobs.with_views(train=tuple(replace(view, mask=left) for view in blobs.train))
+    renderer = VolumetricConfig(StratifiedConfig(4)).build(masked)
+    ctx = Context(masked.bounds, training=True, generator=torch.Generator().manual_seed(0))
+    state = FitState(Blobs(), renderer, None, masked, ctx, 0)  # type: ignore[arg-type]
+    for trace, view in zip(trace_random_rays(state, renderer, 60), masked.train, strict=True):
+        assert trace.samples is not None
+        pixels, z = view.camera.project(trace.samples.position)
+        assert bool((pixels[z > 0.1, 0] < size // 4).all()) and bool((pixels[z > 0.1, 0] >= 0).all())

@@ -13,7 +13,7 @@ from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.training.batches import BatchConfig, Batches
 from invgraphics.training.budget import Budget
 from invgraphics.training.hooks import FitState, Hook, ShDegreeConfig
-from invgraphics.training.losses import CoarseLoss, DistortionLoss, OpacityLoss, PhotometricLoss, ScaleLoss, SsimLoss
+from invgraphics.training.losses import CoarseLoss, DistortionLoss, MaskLoss, OpacityLoss, PhotometricLoss, ScaleLoss, SsimLoss
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
 BOX = Bounds(-torch.ones(3), torch.ones(3))
@@ -272,3 +272,13 @@ def test_bands_come_by_steps_where_the_budget_is_long(step: int, progress: float
     state = FitState(field, None, None, None, ctx, step)
     ShDegreeConfig(start=0.2, interval=0.2, steps=1000).build().before_step(state)
     assert field.active_degree == degree
+
+
+def test_a_mask_of_pixels_is_no_transparency() -> None:
+    """Batches of whole pictures have alpha 0 where a photograph is masked out."""
+    picture, batch = _rendering(4, 5)
+    mask = torch.rand(4, 5) > 0.3
+    opaque = replace(batch, alpha=mask.float(), mask=mask)
+    assert float(MaskLoss(2.0)(picture, Trace(), opaque, CTX)) == 0
+    clear = replace(opaque, alpha=opaque.alpha * (torch.rand(4, 5) > 0.5))
+    assert float(MaskLoss(2.0)(picture, Trace(), clear, CTX)) > 0

@@ -167,7 +167,8 @@ class MemoryRun(FittedRun):
 
         Args:
             budget: of the whole fit from its beginning, ``60s`` or ``5000steps``; ``None`` for the one that it had. A larger
-                one stretches the schedules of a finished fit: its learning rates rise again, to those of the new progress.
+                one stretches all schedules of a finished fit, which are shares of the budget: learning rates rise again, and
+                degrees of harmonics, coarse-to-fine windows, sizes of pictures and scheduled sharpness go back.
 
         Raises:
             InputError: the budget cannot be read.

@@ -71,10 +71,15 @@ def require_density(field: Field) -> None:
 
 
 def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
-    """Generate batches of rays through random pixels, each batch of one random training view."""
+    """Generate batches of rays through random pixels that masks leave, each batch of one random training view."""
     for _ in range(-(-most // RAYS)):
-        camera = scene.train[int(torch.randint(len(scene.train), ()))].camera
-        flat = torch.randint(camera.width * camera.height, (RAYS,))
+        view = scene.train[int(torch.randint(len(scene.train), ()))]
+        camera = view.camera
+        if view.mask is None:
+            flat = torch.randint(camera.width * camera.height, (RAYS,))
+        else:
+            valid = view.mask.reshape(-1).nonzero()[:, 0]
+            flat = valid[torch.randint(len(valid), (RAYS,))]
         yield camera.rays(camera.pixel_centres_of(flat))
 
 

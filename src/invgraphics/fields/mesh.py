@@ -101,7 +101,8 @@ class MeshFieldConfig:
         def truth(index: int) -> Rendering:
             view = views[index]
             assert view.depth is not None
-            depth = view.depth if view.mask is None else torch.where(view.mask, view.depth, torch.inf)
+            depth = torch.where(view.depth > 0, view.depth, torch.inf)
+            depth = depth if view.mask is None else torch.where(view.mask, depth, torch.inf)
             alpha = depth.isfinite().float()
             return Rendering(view.colour() * alpha[..., None], alpha, depth, view.normal)
 

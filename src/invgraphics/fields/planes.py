@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -135,7 +136,8 @@ def depth_span(scene: Scene, reference: Camera) -> tuple[float, float]:
         z = reference.project(scene.points.position.double())[1]
         z = z[z > least]
         if len(z) > 1:
-            return 0.98 * float(z.quantile(POINT_SHARE)), 1.02 * float(z.quantile(1 - POINT_SHARE))
+            near, far = np.quantile(z.numpy(), (POINT_SHARE, 1 - POINT_SHARE))  # torch's takes 16 million numbers at most
+            return 0.98 * float(near), 1.02 * float(far)
     if scene.bounds.space == "contracted":
         return least, FAR_RATIO * least
     corners = torch.cartesian_prod(*torch.stack([scene.bounds.lo, scene.bounds.hi], dim=1).double())

@@ -25,7 +25,8 @@ def slice_density(field: Field, camera: Camera, depths: Float[Tensor, " p"], bou
 
     Slabs meet half-way in inverse depth. A texel's opacity is 1 - exp(-∫ σ dt) over its slab along the reference camera's ray,
     its colour the mean radiance towards that camera, by rendering weight. From the reference camera the image so equals the
-    volume rendering of the field; from elsewhere it is the better the more planes there are.
+    volume rendering of what lies beyond the first slab's near end; nothing before that is in it. From elsewhere it is the
+    better the more planes there are.
 
     Args:
         field: provides density and radiance, local frame.

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from invgraphics.core.bounds import Bounds
@@ -114,7 +114,7 @@ def depth_points(scene: Scene, most: int) -> Points:
     Raises:
         InputError: no training view has a depth map, or they show nothing.
     """
-    views = [view for view in scene.train if view.depth is not None and bool(torch.isfinite(view.depth).any())]
+    views = [view for view in scene.train if view.depth is not None and bool(_hits(view.depth).any())]
     if not views:
         remedy = "Set field.init = 'scene' or 'random'."
         raise InputError(f"The training views of scene '{scene.name}' have no depth maps to start from.", remedy)
@@ -123,11 +123,16 @@ def depth_points(scene: Scene, most: int) -> Points:
     return Points(torch.cat([part.position for part in parts]), torch.cat([part.rgb for part in parts]))
 
 
+def _hits(depth: Float[Tensor, "*p"]) -> Bool[Tensor, "*p"]:
+    """Where a depth map shows a surface; depth cameras write 0 where they have measured nothing."""
+    return torch.isfinite(depth) & (depth > 0)
+
+
 def _seen_points(view: View, most: int) -> Points:
     """Unproject a view's depth map to points; pixels without a hit and masked-out ones are skipped."""
     assert view.depth is not None
     depth = view.depth.reshape(-1)
-    hit = torch.isfinite(depth)
+    hit = _hits(depth)
     if view.mask is not None:
         hit &= view.mask.reshape(-1)
     flat = hit.nonzero()[:, 0]

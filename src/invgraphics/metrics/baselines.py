@@ -60,10 +60,22 @@ def _train(scene: Scene) -> tuple[View, ...]:
 
 
 def _mean_of(views: tuple[View, ...], height: int, width: int) -> Float[Tensor, "h w 4"]:
-    total = torch.zeros(height, width, 4)
+    total, count = torch.zeros(height, width, 4), torch.zeros(height, width, 1)
     for view in views:  # one at a time: hundreds of photographs as floats would not fit in memory
-        total += _premultiplied(view, height, width)
-    return total / len(views)
+        valid = _valid_share(view, height, width)
+        total += valid * _premultiplied(view, height, width)
+        count += valid
+    return total / count.clamp_min(1e-6)
+
+
+def _valid_share(view: View, height: int, width: int) -> Float[Tensor, "h w 1"]:
+    """Share of each pixel, at another size, that a view's mask leaves."""
+    if view.mask is None:
+        return torch.ones(height, width, 1)
+    valid = view.mask[None, None].float()
+    if view.mask.shape != (height, width):
+        valid = F.interpolate(valid, size=(height, width), mode="bilinear", antialias=True, align_corners=False)
+    return valid[0, 0, ..., None]
 
 
 def _premultiplied(view: View, height: int, width: int) -> Float[Tensor, "h w 4"]:

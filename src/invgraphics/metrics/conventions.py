@@ -77,7 +77,7 @@ class Protocol:
         source: of another tool: the repository, its commit, and the files in which this was read; empty for our own.
         measures: name in the scores -> what is measured; ``None`` for every registered metric.
         background: what is put behind transparent pixels; ``scene`` is the colour that the data set declares. Photographs
-            without alpha have no background to choose.
+            without alpha have no background to choose. Other colours are display colours, which linear scenes convert.
         prediction: rounding of the prediction; ``none`` needs unrounded predictions.
         truth: rounding of the truth.
         truth_double: whether the truth is composited in double precision. It decides on which side of a whole byte truncation
@@ -86,6 +86,7 @@ class Protocol:
             windows see no error there; multiplied by ``zero`` in both pictures; or ``unknown`` to the tool.
         crop: pixels left out along each border.
         widest: the tool's loader scales wider pictures down to this width in pixels; ``None``: it does not.
+        truth_opaque: whether the truth's alpha is dropped: transparent pixels show whatever colour they have in the file.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Protocol:
     masks: Literal["excluded", "zero", "unknown"] = "unknown"
     crop: int = 0
     widest: int | None = None
+    truth_opaque: bool = False
 
     def record(self) -> dict[str, Any]:
         """Settings as plain values for a file; optional ones only where they are set."""
@@ -219,6 +221,7 @@ _OTHERS = (
         f"nerfstudio-project/gsplat@90d7b4b examples/simple_trainer.py (eval), examples/datasets/colmap.py, {_TORCHMETRICS}",
         {"psnr": Psnr(), "ssim": Ssim(edges="mirror"), "lpips": Lpips()},
         background=BLACK,
+        truth_opaque=True,
     ),
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from invgraphics import plugins
 from invgraphics.core import Rendering, Scene, View
-from invgraphics.core.colour import linear_to_srgb, quantise
+from invgraphics.core.colour import linear_to_srgb, quantise, srgb_to_linear
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.metrics.base import Inapplicable, Metric, Pair, Skip
 from invgraphics.metrics.conventions import PROTOCOLS, Lpips, Measure, Protocol, Psnr, Rounding, Ssim
@@ -104,7 +104,10 @@ def _composited(rendering: Rendering, view: View, scene: Scene, protocol: Protoc
     background = scene.background
     if view.alpha is not None and protocol.background != "scene":
         background = torch.tensor(protocol.background)
+        background = srgb_to_linear(background) if scene.colour == "linear" else background
     image = rounded(_display(rendering.over(background.to(rendering.rgb)), scene), protocol.prediction)
+    if protocol.truth_opaque:
+        view = replace(view, alpha=None)
     over = _over_in_double if protocol.truth_double and view.image.dtype == torch.uint8 else View.over
     colour = over(view, background.to(view.image.device, torch.float32))
     return image, rounded(_display(colour, scene), protocol.truth).to(image)

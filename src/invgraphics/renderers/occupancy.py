@@ -19,7 +19,7 @@ from invgraphics.kernels.types import March, MarchSteps
 from invgraphics.renderers.fused_kernels import fused_kernel
 from invgraphics.renderers.samplers import check_samples
 from invgraphics.renderers.termination import joined, visible_samples
-from invgraphics.renderers.visibility import cells_near_points, visible_cells
+from invgraphics.renderers.visibility import cells_near_points, flat_cells, visible_cells
 
 Cells = Bool[Tensor, "r r r"]
 LATE_STEPS_START = 0.5
@@ -244,14 +244,13 @@ class OccupancyGridSampler(Sampler):
             self._restrict_occupied(field.support(ctx.bounds, self.config.resolution))
         if step >= self.config.grace and step % self.config.every == 0:
             everywhere = step < self.config.grace + max(self.config.warmup, self.config.every)
-            cells = torch.arange(self.ema.numel(), device=self.ema.device) if everywhere else self._sampled_cells(ctx)
-            self._refresh(cells, field, ctx)
+            self._refresh(flat_cells(self.visible, self.ema) if everywhere else self._sampled_cells(ctx), field, ctx)
 
     def _sampled_cells(self, ctx: Context) -> Int[Tensor, " k"]:
-        """Draw flat cell indices with replacement: half uniform, half from occupied cells."""
-        occupied = torch.nonzero(self.occupied.flatten())[:, 0]
+        """Draw flat cell indices with replacement: half from all visible cells, half from occupied ones."""
+        occupied, visible = torch.nonzero(self.occupied.flatten())[:, 0], flat_cells(self.visible, self.ema)
         half = self.config.cells // 2
-        anywhere = self._draw(self.ema.numel(), self.config.cells - half, ctx)
+        anywhere = visible[self._draw(len(visible), self.config.cells - half, ctx)]
         return torch.cat([anywhere, occupied[self._draw(len(occupied), half, ctx)]]) if len(occupied) else anywhere
 
     def _draw(self, below: int, count: int, ctx: Context) -> Int[Tensor, " count"]:
@@ -271,7 +270,7 @@ class OccupancyGridSampler(Sampler):
         fresh, decay = fresh.view_as(self.ema), self.config.decay_at(ctx.progress)
         self.ema.copy_(torch.where(fresh < 0, self.ema, torch.maximum(self.ema * decay, fresh)))
         # The mean of equal float32 numbers must not exceed them, or an even fog would vanish: sum in float64.
-        mean = float(self.ema.mean(dtype=torch.float64))
+        mean = float((self.ema if self.visible is None else self.ema[self.visible]).mean(dtype=torch.float64))
         self.occupied.copy_(self.ema >= min(self.config.threshold, mean))
         self._restrict_occupied(self.visible)
         self._restrict_occupied(support)

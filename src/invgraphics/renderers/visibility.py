@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from invgraphics.core import Bounds, Camera
@@ -20,7 +20,15 @@ def visible_cells(bounds: Bounds, resolution: int, cameras: Sequence[Camera]) ->
     seen = _corners(bounds, resolution, 0.0, cameras)
     padded = seen[:-1] | seen[1:]
     padded = padded[:, :-1] | padded[:, 1:]
-    return (padded[:, :, :-1] | padded[:, :, 1:]) | _corners(bounds, resolution, 0.5, cameras)
+    seen = (padded[:, :, :-1] | padded[:, :, 1:]) | _corners(bounds, resolution, 0.5, cameras)
+    return seen & cells_in_ball(resolution).to(seen.device) if bounds.space == "contracted" else seen
+
+
+def cells_in_ball(resolution: int) -> Bool[Tensor, "r r r"]:
+    """Mask of the unit cube's cells that meet the ball in it, into which endless space is contracted."""
+    edges = (torch.arange(resolution + 1) / resolution - 0.5).abs()
+    nearest = torch.minimum(edges[:-1], edges[1:]).square()
+    return nearest[:, None, None] + nearest[:, None] + nearest <= 0.25
 
 
 def _corners(bounds: Bounds, resolution: int, offset: float, cameras: Sequence[Camera]) -> Bool[Tensor, "k k k"]:
@@ -36,6 +44,12 @@ def _corners(bounds: Bounds, resolution: int, offset: float, cameras: Sequence[C
         inside = ((pixel >= -IMAGE_MARGIN * size) & (pixel <= (1 + IMAGE_MARGIN) * size)).all(dim=1)
         seen |= inside & (depth > 0) & ((position - at.position).norm(dim=1) >= bounds.near)
     return seen.view(count, count, count)
+
+
+def flat_cells(mask: Bool[Tensor, "r r r"] | None, grid: Tensor) -> Int[Tensor, " k"]:
+    """Flat indices of the cells of ``mask``; of all cells of ``grid`` where there is no mask, or nothing in it."""
+    found = None if mask is None else torch.nonzero(mask.flatten())[:, 0]
+    return torch.arange(grid.numel(), device=grid.device) if found is None or len(found) == 0 else found
 
 
 @torch.no_grad()

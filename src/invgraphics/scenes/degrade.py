@@ -10,7 +10,7 @@ in proportion to its setting: two levels of one study share their random numbers
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
@@ -51,7 +51,8 @@ class TrainingData:
         photo_noise: standard deviation of Gaussian noise on each channel, as a share of white.
         exposure: standard deviation, in stops, of each photograph's exposure, applied to linear light.
         background: ``random`` keeps the photographs' alpha; a colour (``white``, ``grey``, ``black`` or [r, g, b] in [0, 1])
-            puts every photograph in front of it and drops the alpha, and the fit composites over the same colour. What is empty
+            puts every photograph in front of it and drops the alpha, and the fit composites over the same colour, a display
+            colour that linear scenes convert. What is empty
             can then not be told from what has this colour: fits are slower and end lower.
         scales: divisors of the photographs' size; every training view is shown once at each (multiscale training of mip-NeRF).
             Rendered scenes are rendered at each size, photographs averaged (`invgraphics.scenes.scales`).
@@ -143,10 +144,16 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
         return scene
     data.check(scene)
     chosen = chosen_views(scene, data.train_views)
-    shown = [(scale, scene_at(scene, scale).train) for scale in data.scales]
-    train = [_degraded(_named(views[index], scale), index, scene, data, seed) for scale, views in shown for index in chosen]
+    shown = [(scale, _at_scale(scene, scale)) for scale in data.scales]
+    train = [
+        _degraded(_named(views[index], scale), index, scene, data, seed)
+        for scale, views in shown
+        for index in chosen
+        if index in views
+    ]
+    train, blank = _without_blank(train, scene)
     done = [f"{name} = {value}" for name, value in changes.items() if name not in ("test_scales", "box")]
-    notes = scene.notes | ({"training_data": ", ".join(done)} if done else {})
+    notes = scene.notes | ({"training_data": ", ".join(done)} if done else {}) | blank
     if data.changes_photographs and notes.pop("exposures", None):
         scene = replace(scene, exposure_spread=None)  # estimated from all photographs as they were
     if data.changes_photographs or data.pose_noise or data.init != "scene":
@@ -154,6 +161,7 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
         train = [replace(view, landmarks=None) for view in train]
     if data.background != KEEP:
         colour = torch.tensor(COLOURS[data.background] if isinstance(data.background, str) else data.background)
+        colour = srgb_to_linear(colour) if scene.colour == "linear" else colour
         train = [replace(view, image=like(view.over(colour), view), alpha=None) for view in train]
         scene = replace(scene, background=colour)
     return _with_points(replace(scene, train=tuple(train), notes=notes), data, seed)
@@ -206,6 +214,28 @@ def chosen_views(scene: Scene, count: int | None) -> list[int]:
     return sorted(order)
 
 
+def _at_scale(scene: Scene, scale: int) -> dict[int, View]:
+    """Training views at 1/``scale`` by their index; a mask may leave no pixel of one that small, which is then not there."""
+    views = scene_at(scene, scale).train
+    if len(views) == len(scene.train):
+        return dict(enumerate(views))
+    by_name = {view.name: view for view in views}
+    return {index: by_name[view.name] for index, view in enumerate(scene.train) if view.name in by_name}
+
+
+def _without_blank(views: Sequence[View], scene: Scene) -> tuple[list[View], dict[str, str]]:
+    """Leave out views of which masks leave no pixel once they are smaller; returns the others, and a note.
+
+    Raises:
+        InputError: none is left.
+    """
+    kept = [view for view in views if view.mask is None or bool(view.mask.any())]
+    if not kept:
+        raise InputError(f"The masks of '{scene.name}' leave no pixel of any training view at this size.", "Use larger ones.")
+    lost = len(views) - len(kept)
+    return kept, {"blank_views": f"{lost} smaller ones without a valid pixel are left out"} if lost else {}
+
+
 def _named(view: View, scale: int) -> View:
     return view if scale == 1 else replace(view, name=f"{view.name} at 1/{scale}")
 
@@ -226,10 +256,10 @@ def _degraded(view: View, index: int, scene: Scene, data: TrainingData, seed: in
         view = resized_view(view, *wanted_size(view.camera.width, view.camera.height, data.size))
     if data.exposure:
         stops = data.exposure * float(torch.randn((), generator=_generator(seed, "exposure", index)))
-        view = _recoloured(view, lambda colour: _exposed(colour, 2**stops, scene.colour == "linear"))
+        view = _recoloured(view, scene, lambda colour: _exposed(colour, 2**stops, scene.colour == "linear"))
     if data.photo_noise:
         generator = _generator(seed, "photo", index)
-        view = _recoloured(view, lambda colour: colour + data.photo_noise * torch.randn(colour.shape, generator=generator))
+        view = _recoloured(view, scene, lambda rgb: rgb + data.photo_noise * torch.randn(rgb.shape, generator=generator))
     return view
 
 
@@ -245,8 +275,9 @@ def _rotation(vector: Float[Tensor, 3]) -> Float[Tensor, "3 3"]:
     return torch.linalg.matrix_exp(vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
 
 
-def _recoloured(view: View, change: Callable[[Tensor], Tensor]) -> View:
-    return replace(view, image=like(change(view.colour()), view))
+def _recoloured(view: View, scene: Scene, change: Callable[[Tensor], Tensor]) -> View:
+    colour = change(view.colour())
+    return replace(view, image=like(colour if scene.colour == "linear" else colour.clamp_max(1), view))
 
 
 def _exposed(colour: Float[Tensor, "*p"], gain: float, linear: bool) -> Float[Tensor, "*p"]:

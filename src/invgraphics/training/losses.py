@@ -187,7 +187,8 @@ class MaskLoss:
 
     def __call__(self, rendering: Rendering, trace: Trace, batch: Batch, ctx: Context) -> Float[Tensor, ""]:
         """The weighted mean over pixels, in nats; over the sharpness where there is one."""
-        masked = (batch.alpha < 1).any()  # stays on the device
+        clear = batch.alpha < 1
+        masked = (clear if batch.mask is None else clear & batch.mask).any()  # stays on the device
         if trace.surface is None:
             alpha = rendering.alpha.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY)
             # Not torch's own, which raises an error of its own on NaN: a fit names the value and keeps its checkpoint.

@@ -154,8 +154,9 @@ class L1Penalty:
 class SparsityPenalty:
     """Cauchy penalty log(1 + 2 σ²) on the density (Plenoxels, equation 4; Hedman et al. 2021), against fog.
 
-    The mean over random points of the scene's bounds, where Plenoxels sums over the samples of a step's rays: a mean over
-    points needs no rays and does not depend on how many are taken. σ is per local length unit.
+    The mean over random points of the scene's box or, in endless space, of the contracted ball, where Plenoxels sums over the
+    samples of a step's rays: a mean over points needs no rays and does not depend on how many are taken. σ is per local length
+    unit.
 
     Attributes:
         weight: factor.
@@ -174,10 +175,21 @@ class SparsityPenalty:
 
     def __call__(self, field: Field, renderer: Renderer, ctx: Context) -> Float[Tensor, ""]:
         """The weighted mean."""
-        position = ctx.bounds.from_unit(ctx.rand((self.points, 3), like=ctx.bounds.lo))
+        position = ctx.bounds.from_unit(_even_in(ctx, self.points))
         density = field.query(Samples.at(position), Quantity.DENSITY).density
         assert density is not None
         return self.weight * torch.log1p(2 * density.square()).mean()
+
+
+def _even_in(ctx: Context, count: int) -> Float[Tensor, "n 3"]:
+    """Random points of the unit cube, even in what the bounds describe: all of it, or the contracted ball in it."""
+    unit = ctx.rand((count, 3), like=ctx.bounds.lo)
+    if ctx.bounds.space == "box":
+        return unit
+    height, turn = 2 * unit[:, 0] - 1, 2 * math.pi * unit[:, 1]
+    across = (1 - height.square()).clamp_min(0).sqrt()
+    direction = torch.stack([across * turn.cos(), across * turn.sin(), height], dim=1)
+    return 0.5 + 0.5 * unit[:, 2:].pow(1 / 3) * direction
 
 
 def lattice_field(field: Field, name: str) -> LatticeField:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 from typing_extensions import Protocol, override, runtime_checkable
 
-from invgraphics.core import Field, RayRenderer, Renderer, Trace
+from invgraphics.core import Field, RayRenderer, Renderer, Trace, View
 from invgraphics.core.lattice import LatticeEncoding, LatticeField
 from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
@@ -95,16 +95,29 @@ def _grids(field: Field) -> list[Prunable]:
 
 
 def trace_random_rays(state: FitState, renderer: RayRenderer, count: int) -> Iterator[Trace]:
-    """Render ``count`` random training rays as evaluation does, an equal share per view; yields traces of some at a time."""
+    """Render ``count`` random training rays as evaluation does, an equal share per view; yields traces of some at a time.
+
+    No ray goes through masked-out pixels: nothing is fitted to what it sees.
+    """
     cameras = state.cameras()
     ctx = replace(state.ctx, training=False)
     share = -(-count // len(cameras))
-    for camera in cameras:
-        size = torch.tensor([camera.width, camera.height])
-        pixels = (torch.rand(share, 2, generator=state.ctx.generator) * size).to(camera.focal)
+    for camera, view in zip(cameras, state.scene.train, strict=True):
+        pixels = _random_places(view, share, state.ctx.generator).to(camera.focal)
         for rays in camera.rays(pixels).to(ctx.bounds.lo.device).chunks(RAYS_AT_ONCE):
             _, trace = renderer.render_rays(state.field, rays, ctx)
             yield trace
+
+
+def _random_places(view: View, count: int, generator: torch.Generator | None) -> Float[Tensor, "n 2"]:
+    """Random image points (x, y) of a view, in pixels that its mask leaves."""
+    place = torch.rand(count, 2, generator=generator) * torch.tensor([view.camera.width, view.camera.height])
+    if view.mask is None:
+        return place
+    valid = view.mask.reshape(-1).nonzero()[:, 0]
+    flat = valid[torch.randint(len(valid), (count,), generator=generator).to(valid.device)].cpu()
+    corner = torch.stack([flat % view.camera.width, flat // view.camera.width], dim=1)
+    return corner + place.frac()
 
 
 @torch.no_grad()
