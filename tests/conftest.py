@@ -3,6 +3,7 @@
 import shared_cores  # noqa: F401, I001  # before torch, as the next one
 import invgraphics  # noqa: F401  # before torch, which then reads how long its waiting threads may spin
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,8 @@ import torch
 from invgraphics import kernels
 from invgraphics.experiments.recorder import Monitor
 
+gc.disable()  # imports and collection make a million objects that live on: looking through them again and again takes seconds
+
 pytest_plugins = ["shared_folders", "training_fixtures"]
 
 
@@ -22,9 +25,20 @@ LONGEST = (
     "scenes/test_import_photos.py",
     "sabotage/test_sabotage.py",
     "experiments/test_terminated.py",
+    "experiments/test_run.py",
     "report/test_report_browser.py",
+    "test_extending.py",
+    "test_registering.py",
+    "kernels/test_instruction_sets.py",
 )
 """Files that come first, so that none of them is left to one of several processes when the others have finished."""
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from here on, but not among what the collection of tests has made."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -19,10 +19,12 @@ from invgraphics.errors import InputError
 from invgraphics.experiments import build, fitted
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
+from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import read_gaussians, write_gaussians
 from invgraphics.runs.run import read_run
 from invgraphics.tools import EXPORTERS
 from invgraphics.tools.export import ExportRequest, export_run
+from invgraphics.tools.file_frames import file_from_world
 from invgraphics.tools.import_gaussians import ImportRequest, import_run
 
 METHOD = "splatting/gaussians"
@@ -234,3 +236,54 @@ def test_a_gaussian_too_far_for_a_format_is_refused(run: Path, tmp_path: Path) -
     with pytest.raises(InputError, match="SPZ holds up to"):
         write_gaussians(tmp_path / "a.spz", "spz", replace(splats, gaussians=far))
     assert set(EXPORTERS) == {"ply", "splat", "spz", "mesh", "mpi"}
+
+
+def test_a_file_in_nerfstudio_s_frame_is_placed_by_its_transform(
+    run: Path, toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Turned, shifted and scaled as nerfstudio does; without the similarity a warning says that little of it can be seen."""
+    file, placed = tmp_path / "model.ply", tmp_path / "splat.ply"
+    export_run(ExportRequest(run, "ply", file))
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix())
+    matrix[:3, 3] = torch.tensor([40.0, -20.0, 70.0])
+    scaled = matrix.clone()
+    scaled[:3] *= 0.125
+    splats = read_gaussians(file)[1]
+    write_gaussians(placed, "ply", replace(splats, gaussians=transform_gaussians(splats.gaussians, scaled.float())))
+    table = {"transform": matrix[:3].tolist(), "scale": 0.125}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(table))
+    words = ["--scene", str(toy_folder), "--test-views", "2"]
+    assert main.run(["import", str(file), *words, "--out", str(tmp_path / "own")]) == main.DONE
+    assert "Warning" not in capsys.readouterr().err
+    transform = ["--transform", str(tmp_path / "dataparser_transforms.json")]
+    assert main.run(["import", str(placed), *words, *transform, "--out", str(tmp_path / "theirs")]) == main.DONE
+    assert "Warning" not in capsys.readouterr().err
+    own, theirs = (_quality(tmp_path / name)["psnr"] for name in ("own", "theirs"))
+    assert theirs == pytest.approx(own, abs=0.05)
+    notes = json.loads((tmp_path / "theirs" / "provenance.json").read_text())["imported"]["notes"]
+    assert any("0.125" in note for note in notes)
+    assert main.run(["import", str(placed), *words, "--out", str(tmp_path / "lost")]) == main.DONE
+    assert re.search(r"Warning: \d% of the Gaussians lie in a training picture; it may be in a frame", capsys.readouterr().err)
+    assert _quality(tmp_path / "lost")["psnr"] < own - 3
+    for bad, said in (({"scale": 1}, "is no finite matrix"), (table | {"scale": 0}, "is 0, no positive number")):
+        (tmp_path / "bad.json").write_text(json.dumps(bad))
+        assert main.run(["import", str(placed), *words, "--transform", str(tmp_path / "bad.json")]) == main.BAD_INPUT
+        assert said in capsys.readouterr().err
+    assert main.run(["import", str(placed), *words, *transform, "--frame", "z-up"]) == main.BAD_INPUT
+
+
+def test_a_data_set_s_applied_transform_is_taken_out_of_nerfstudio_s(tmp_path: Path) -> None:
+    """A point of the world in which COLMAP placed the photographs goes to one place along both ways."""
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.0, 0.5, 1.0]).as_matrix())
+    applied = torch.eye(4, dtype=torch.float64)[[1, 0, 2, 3]]
+    applied[2, 2] = -1
+    rest = turn.clone()
+    rest[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    (tmp_path / "transforms.json").write_text(json.dumps({"applied_transform": applied[:3].tolist(), "applied_scale": 0.5}))
+    saved = {"transform": (rest @ applied)[:3].tolist(), "scale": 4.0 * 0.5}
+    (tmp_path / "saved.json").write_text(json.dumps(saved))
+    expected = rest.clone()
+    expected[:3] *= 4.0
+    torch.testing.assert_close(file_from_world(tmp_path / "saved.json", str(tmp_path)), expected)

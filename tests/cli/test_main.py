@@ -265,3 +265,10 @@ def test_arguments_default_to_those_of_the_process(monkeypatch, capsys) -> None:
         main.main()
     assert stop.value.code == 0
     assert capsys.readouterr().out.strip()
+
+
+def test_commas_within_values_do_not_separate_names() -> None:
+    sampler = 'volumetric/hash:renderer.sampler={type="stratified",samples=64}'
+    lists = "volumetric/nerf:hooks=[[1,2],[3,4]]"
+    quoted = "a:b='x,y'"
+    assert parse_list(f"{sampler},{lists},{quoted}, c", "--methods") == (sampler, lists, quoted, "c")

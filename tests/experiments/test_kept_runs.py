@@ -93,5 +93,5 @@ def test_a_comparison_that_is_interrupted_lists_no_run_of_earlier_code(
     found = [Path(name).name for name in json.loads((tmp_path / "compare.json").read_text())["runs"]]
     assert ended == (["seed-2"] if keep else ["seed-0", "seed-1", "seed-2"])
     assert found == (["seed-0", "seed-1"] if keep else ["seed-1"])
-    replaced = "1 finished run is of other code or pictures, and fitted again; --keep keeps what other code made."
+    replaced = "1 finished run is of other code, packages or pictures, and fitted again; --keep keeps what other"
     assert (replaced in capsys.readouterr().err) is not keep

@@ -337,7 +337,7 @@ def test_a_fit_goes_on_by_other_code_where_that_is_asked_for(
     (folder / "scores.json").unlink()
     for user in ("identity", "run", "environment"):
         monkeypatch.setattr(f"invgraphics.experiments.{user}.code_version", lambda: "9.9+later")
-    with pytest.raises(InputError, match=r"holds a run of other code, threads or kernels\.\nAdd --keep to go on with it"):
+    with pytest.raises(InputError, match=r"of other code, packages, threads or kernels, or from another source\.\nAdd --keep"):
         fit_run(_request(toy_folder, folder, existing="resume"))
     record = json.loads((folder / "provenance.json").read_text())
     (folder / "provenance.json").write_text(json.dumps(record | {"train_sha256": "0" * 64}))
@@ -347,11 +347,13 @@ def test_a_fit_goes_on_by_other_code_where_that_is_asked_for(
     for _ in range(2):  # the second time the code is the same
         fit_run(_request(toy_folder, folder, existing="resume", keep=True))
         found = json.loads((folder / "environment.json").read_text())
-        assert found["begun_on"] == [f"code: invgraphics {before['code_version']}"]
+        assert found["begun_on"] == [
+            f"code: invgraphics {before['code_version']}, {torch.get_num_threads()} thread{'s' * (torch.get_num_threads() > 1)}"
+        ]
         (folder / "scores.json").unlink()
     after = json.loads((folder / "provenance.json").read_text())
     assert after["code_version"] == "9.9+later" and after["cell_sha256"] != before["cell_sha256"]
-    assert capsys.readouterr().err.count("the fit was begun by other code (invgraphics ") == 1
+    assert capsys.readouterr().err.count("the fit was begun by other code, threads or packages (invgraphics ") == 1
 
 
 def test_a_checkpoint_that_other_code_cannot_read_is_refused(
@@ -456,3 +458,41 @@ def test_a_checkpoint_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError) as caught:
         save(path, {"fit": {"steps": torch.zeros(1)}})
     assert caught.value.filename == str(path)
+
+
+def test_scores_of_an_interrupted_fit_would_end_it(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    """`evaluate` refuses it, and what an earlier protocol said of its checkpoint is gone once it goes on."""
+    folder = shutil.copytree(run, tmp_path / "run")
+    (folder / "scores.json").unlink()
+    lines = (folder / "history.jsonl").read_text().splitlines()
+    half = [line for line in lines if json.loads(line)["progress"] <= 0.5]
+    (folder / "history.jsonl").write_text("\n".join(half) + "\n")
+    with pytest.raises(InputError, match=r"is not finished: \d+% of its budget are recorded"):
+        evaluate_run(folder)
+    (folder / "scores.float.json").write_text("{}")
+    fit_run(_request(toy_folder, folder, existing="resume"))
+    assert (folder / "scores.json").is_file() and not (folder / "scores.float.json").exists()
+
+
+def test_packages_and_kernels_are_part_of_a_run_s_identity(
+    run: Path, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shutil.copytree(run, tmp_path / "run")
+    request = _request(toy_folder, folder)
+    truth = truth_digest(open_scene(str(toy_folder), SceneOptions()))
+    here = run_digest(Job.of(request), truth, 2)
+    named = json.loads((run / "environment.json").read_text())["kernels"]
+    assert run_digest(Job.of(replace(request, kernels=named)), truth, 2) == here
+    other = "reference" if named != "reference" else "numba"
+    assert run_digest(Job.of(replace(request, kernels=other)), truth, 2) != here
+    with pytest.raises(InputError, match=f"holds another run: its kernels is {named}, not {other}"):
+        check_replaceable(Job.of(replace(request, kernels=other)))
+    monkeypatch.setattr(torch, "__version__", "9.9.9")
+    assert run_digest(Job.of(request), truth, 2) != here
+
+
+def test_another_start_of_the_same_photographs_is_named(run: Path, toy_folder: Path) -> None:
+    """`compare` may have chosen it for all methods, so that no --set of the user's made the difference."""
+    changed = _request(toy_folder, run, overrides=(*SMALL[METHOD], "data.init=random"))
+    with pytest.raises(InputError, match=r"its training data is .*\nAdd --set data.init=scene\."):
+        check_replaceable(Job.of(changed))

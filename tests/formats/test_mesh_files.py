@@ -13,7 +13,9 @@ from plyfile import PlyData
 from invgraphics.core import Mesh
 from invgraphics.core.colour import srgb_to_linear
 from invgraphics.errors import InputError
-from invgraphics.formats.mesh import SUFFIXES, read_mesh, write_mesh
+from invgraphics.formats.mesh import SUFFIXES, mesh_from_file, read_mesh, write_mesh
+from invgraphics.testing import toy_scene
+from invgraphics.tools.file_frames import file_from_local
 
 CORNERS = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
 FACES = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -68,6 +70,25 @@ def test_glb_has_linear_unlit_colours(solid: Mesh, tmp_path: Path) -> None:
     assert "KHR_materials_unlit" in material["extensions"]
     assert "KHR_materials_unlit" in tree["extensionsUsed"]
     assert tree["asset"]["copyright"] == "made by a test"
+
+
+@pytest.mark.parametrize("world", ["z-up", "opencv", "LUF", "no axes", None])
+def test_a_glb_comes_back_from_whatever_world_it_was_turned(solid: Mesh, tmp_path: Path, world: str | None) -> None:
+    """By what it says; without, or with nonsense, the world counts as z-up."""
+    scene, path = toy_scene(views=2, size=8), tmp_path / "a.glb"
+    named = world if world in ("opencv", "LUF") else "z-up"
+    write_mesh(path, solid.transformed(file_from_local(scene, "opengl", named)), RGB, world=named)
+    if world not in ("opencv", "LUF", "z-up"):
+        text = b'"z-up"'
+        other = (b'"' + world.encode() + b'"') if world else b"null"
+        data = path.read_bytes()
+        assert data.count(text) == 1
+        length = int.from_bytes(data[12:16], "little")
+        chunk = data[20 : 20 + length].replace(text, other)
+        chunk += b" " * (-len(chunk) % 4)
+        whole = struct.pack("<III", *struct.unpack_from("<II", data), len(data) - length + len(chunk))
+        path.write_bytes(whole + struct.pack("<I", len(chunk)) + data[16:20] + chunk + data[20 + length :])
+    torch.testing.assert_close(mesh_from_file(path, scene).vertices, CORNERS, atol=1e-5, rtol=0)
 
 
 def test_bad_files_get_a_sentence(solid: Mesh, tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ def test_a_stored_3d_filter_is_applied(tmp_path: Path) -> None:
     PlyData([PlyElement.describe(table, "vertex")]).write(tmp_path / "filtered.ply")
     bare, filtered = (read_gaussians(tmp_path / f"{name}.ply")[1] for name in ("bare", "filtered"))
     assert any("filter_3D" in note for note in filtered.notes) and not bare.notes
+    assert (filtered.antialiased, bare.antialiased) == (True, None)  # its 2D filter keeps the integral, too
     bare, filtered = bare.gaussians, filtered.gaussians
     variance = bare.scales**2 + torch.from_numpy(table["filter_3D"].copy())[:, None] ** 2
     torch.testing.assert_close(filtered.scales**2, variance)

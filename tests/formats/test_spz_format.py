@@ -1,5 +1,6 @@
 """SPZ against files that the format's authors' own library (nianticlabs/spz, C++) wrote."""
 
+import gzip
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -133,3 +134,14 @@ def test_a_fifth_band_is_left_out(tmp_path: Path) -> None:
     assert splats.gaussians.sh.shape == (1, 16, 3)
     assert torch.allclose(splats.gaussians.sh[0, 1:].flatten(), (torch.arange(45.0) - 128) / 128)
     assert any("degree 4" in note for note in splats.notes)
+
+
+def test_version_3_is_what_the_authors_library_writes(tmp_path: Path) -> None:
+    """Byte by byte once decompressed, but for the number of fraction bits, which ours chooses."""
+    write_gaussians(tmp_path / "a.spz", "spz", Splats(original(), "RUB", antialiased=True), version=3)
+    assert_alike(read_gaussians(tmp_path / "a.spz")[1].gaussians, rotation=1e-5)
+    ours, theirs = (gzip.decompress(data) for data in ((tmp_path / "a.spz").read_bytes(), bytes.fromhex(WRITTEN[3])))
+    head, known = struct.unpack_from("<4sIIBBBB", ours), struct.unpack_from("<4sIIBBBB", theirs)
+    assert head[:4] == known[:4] and head[5] == known[5] == 1
+    positions = 16 + 9 * len(original())
+    assert len(ours) == len(theirs) and ours[positions:] == theirs[positions:]

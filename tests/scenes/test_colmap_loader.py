@@ -297,3 +297,25 @@ def test_beer_points_project_onto_their_observations(data) -> None:
         shuffled.append(np.abs(picture - rgb[inside][::-1]).mean(1))
     assert np.median(np.concatenate(distances)) < 1.5
     assert np.median(np.concatenate(differences)) < 0.5 * np.median(np.concatenate(shuffled))
+
+
+def test_photographs_of_other_names_in_a_named_folder_are_taken_in_order(tmp_path: Path) -> None:
+    """LLFF's scaled copies are called image000.png, those of the model IMG_4026.JPG."""
+    root = mixed(tmp_path / "garden")
+    reduced(root, 80, 60)
+    for index, photo in enumerate(sorted((root / "images_4").iterdir())):
+        photo.rename(root / "images_4" / f"image{index:03}.png")
+    scene = validate(find_loader(root / "images_4").load(root / "images_4", SceneOptions()))
+    assert scene.train[0].camera.width == 80 and len(scene.train) + len(scene.test) == 9
+    assert_dots_are_found(scene)
+    (root / "images_4" / "image003.png").unlink()
+    with pytest.raises(InputError, match=r"images_4 has none of the 9 photographs that .* lists, and 8 of other names"):
+        find_loader(root / "images_4").load(root / "images_4", SceneOptions())
+
+
+def test_a_model_of_any_name_below_sparse_has_the_workspace_s_photographs(tmp_path: Path) -> None:
+    root = mixed(tmp_path / "garden")
+    (root / "sparse" / "0").rename(root / "sparse" / "aligned")
+    for given in (root, root / "sparse" / "aligned"):
+        scene = validate(find_loader(given).load(given, SceneOptions()))
+        assert scene.name == "garden" and len(scene.train) + len(scene.test) == 9

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dots import Eye, assert_dots_are_found, ring, save
+from PIL import Image
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.idr import Idr
@@ -82,4 +83,15 @@ def test_bad_input_is_a_sentence(tmp_path: Path) -> None:
         Idr().load(path, SceneOptions())
     (path / "mask" / "000.png").unlink()
     with pytest.raises(InputError, match=r"8 masks, .* has 9 pictures"):
+        Idr().load(path, SceneOptions())
+
+
+def test_pictures_that_were_resized_without_their_matrices_are_refused(tmp_path: Path) -> None:
+    """The matrices hold no size: at half of it the principal point is at the pictures' end."""
+    path = write(tmp_path, ring(9))
+    for folder in ("image", "mask"):
+        for file in (path / folder).iterdir():
+            with Image.open(file) as picture:
+                picture.resize((80, 60), Image.Resampling.BOX).save(file)
+    with pytest.raises(InputError, match=r"lie at 1.04 of the pictures' width and 0.97 of their height: pictures were resized"):
         Idr().load(path, SceneOptions())

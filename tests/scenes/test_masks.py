@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from dots import ring, save
+from PIL import Image
 from test_nerfstudio_loader import DISTORTED, edit, write
 
 from invgraphics.core import Scene
@@ -143,3 +144,14 @@ def test_a_mask_path_that_is_no_text_is_a_sentence(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps(table))
     with pytest.raises(InputError, match="'mask_path'"):
         load(folder)
+
+
+@pytest.mark.parametrize(("kind", "suffix"), [(np.uint8, ".png"), (np.uint16, ".png"), (np.uint8, ".jpg")])
+def test_every_label_above_zero_counts_where_nothing_is_lost(tmp_path: Path, kind: type, suffix: str) -> None:
+    """As for COLMAP and nerfstudio; black in a JPEG is not exactly 0, so that half of the maximum decides there."""
+    labels = np.zeros((16, 64), kind)
+    for label in (1, 2, 3):
+        labels[:, 16 * label :] = label if suffix == ".png" else (9, 140, 250)[label - 1]
+    Image.fromarray(labels).save(tmp_path / f"labels{suffix}")
+    valid = read_mask(tmp_path / f"labels{suffix}", 64, 16)[8, :, 0] == 255
+    assert torch.equal(torch.from_numpy(valid)[8::16], torch.tensor([False, suffix == ".png", True, True]))

@@ -456,3 +456,14 @@ def test_transparent_pictures_without_a_focus_before_them_are_of_endless_space(
     scene = validate(Nerfstudio().load(path, SceneOptions()))
     assert scene.has_alpha
     assert scene.bounds.space == "contracted"
+
+
+def test_scaled_copies_that_alone_were_kept_are_found(tmp_path: Path) -> None:
+    write(tmp_path, ring(8, distortion=opencv), {**DISTORTED, "w": 160, "h": 120})
+    (tmp_path / "images").rename(tmp_path / "images_2")
+    for photo in (tmp_path / "images_2").iterdir():
+        with Image.open(photo) as picture:
+            picture.resize((80, 60), Image.Resampling.BOX).save(photo)
+    scene = Nerfstudio().load(tmp_path, SceneOptions())
+    assert {(view.camera.width, view.camera.height) for view in scene.train} == {(80, 60)}
+    assert_dots_are_found(scene)

@@ -6,9 +6,9 @@ import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
-from invgraphics.api.keeping import reopenable_scene
+from invgraphics.api.keeping import Kept, reopenable_scene
 from invgraphics.api.loading import (
     MethodLike,
     as_scene,
@@ -116,6 +116,7 @@ def compare(
     device: Literal["cpu", "cuda"] | None = None,
     render_with: Sequence[str] | str = (),
     data: Mapping[str, Any] | None = None,
+    **more: Unpack[Kept],
 ) -> ComparisonResult:
     """Fit several methods to one scene under one budget, each in its own process, and write a report.
 
@@ -135,6 +136,7 @@ def compare(
             ``{"train_views": 4, "init": "sfm"}`` (`invgraphics.scenes.degrade.TrainingData` explains them). On a rendered
             scene, methods that start from points are given those found in the training photographs (``sfm``) instead of
             the exact ones, unless ``data["init"]`` says otherwise; the ``--set`` of a printed hint is ``data`` here.
+        **more: ``keep=True``: finished fits stay although code or packages have changed since.
 
     Raises:
         InputError: something cannot be used; found before the first fit.
@@ -153,7 +155,7 @@ def compare(
     _, place = reopenable_scene(scene, folder)
     shown = tuple(listed(render_with, str))
     settings: dict[str, Any] = {"budget": budget, "device": device, "render_with": shown, "overrides": data_overrides(data)}
-    settings |= {"seeds": whole_seeds(seeds), "out": str(folder), **place}
+    settings |= {"seeds": whole_seeds(seeds), "out": str(folder), **place, **more}
     root, _ = comparing.compare(CompareRequest(methods=names, optional=optional, **settings))
     return ComparisonResult(root)
 

@@ -30,9 +30,11 @@ class Kept(TypedDict, total=False):
 
     Attributes:
         snapshots: states of the model, for a time-lapse.
+        keep: whether an unfinished fit goes on although code, threads or packages have changed since.
     """
 
     snapshots: int
+    keep: bool
 
 
 @overload
@@ -88,7 +90,8 @@ def fit(
             ``{"train_views": 4, "init": "sfm"}`` (`invgraphics.scenes.degrade.TrainingData` explains them).
         on_step: is given the fit before its first step and after each one, on no clock: ``fit.steps``, ``fit.seconds``,
             ``fit.progress``, ``fit.model``, ``fit.plan``.
-        **kept: ``snapshots=N``: states of the model that ``out`` keeps for a time-lapse, evenly over the fit.
+        **kept: ``snapshots=N``: states of the model that ``out`` keeps for a time-lapse, evenly over the fit; ``keep=True``:
+            the fit in ``out`` goes on although code, threads or packages have changed since.
 
     Raises:
         InputError: something cannot be used, or ``out`` holds another run; nothing has been computed then.
@@ -103,10 +106,11 @@ def fit(
         (torch.Size([16, 16, 3]), True, 20)
     """
     scene = as_scene(scene)
-    snapshots = kept.pop("snapshots", 0)
+    snapshots, keep = kept.pop("snapshots", 0), kept.pop("keep", False)
     if kept:
         raise TypeError(f"fit() got an unexpected keyword argument '{next(iter(kept))}'")
-    settings: dict[str, Any] = {"budget": budget, "seed": whole_seeds([seed])[0], "device": device, "snapshots": snapshots}
+    settings: dict[str, Any] = {"budget": budget, "seed": whole_seeds([seed])[0], "device": device}
+    settings |= {"snapshots": snapshots, "keep": keep}
     source = source_of(scene)
     where = scene.name if source is None else source.spec
     request = FitRequest(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -16,6 +16,16 @@ from invgraphics.scenes.open import SceneOptions, open_scene, source_of
 
 CAMERA = ("cam_to_world", "focal", "principal_point")
 """Tensors of a camera; its size is that of the picture."""
+
+
+class Kept(TypedDict, total=False):
+    """What a comparison or a study keeps of an earlier call.
+
+    Attributes:
+        keep: whether finished fits stay although code or packages have changed since.
+    """
+
+    keep: bool
 
 
 def reopenable_scene(scene: Scene, folder: Path) -> tuple[Scene, dict[str, Any]]:

@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
+from invgraphics.api.keeping import Kept
 from invgraphics.api.loading import whole_seeds
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
@@ -109,6 +110,7 @@ def ablate(
     device: Literal["cpu", "cuda"] | None = None,
     jobs: int = 1,
     confirm: Callable[[Forecast], None] = _announce,
+    **more: Unpack[Kept],
 ) -> StudyResult:
     r"""Run every cell of a study that is missing, and write its report.
 
@@ -121,6 +123,7 @@ def ablate(
         device: ``cpu`` or ``cuda``; ``None`` for the CPU.
         jobs: cells that share this machine at the same time; each gets an equal part of its cores.
         confirm: is shown the forecast before the first fit, and may raise to call it off.
+        **more: ``keep=True``: finished cells stay although code or packages have changed since.
 
     Raises:
         InputError: something cannot be used; found before the first fit.
@@ -137,7 +140,7 @@ def ablate(
     """
     name = os.fspath(study)
     folder = Path("reports") / studies.name_of(studies.locate(name)) if out is None else Path(out)
-    given: dict[str, Any] = {"budget": budget, "size": size, "device": device, "jobs": jobs}
+    given: dict[str, Any] = {"budget": budget, "size": size, "device": device, "jobs": jobs, **more}
     given |= {} if seeds is None else {"seeds": whole_seeds(seeds)}
     root, _ = ablating.ablate(AblateRequest(study=name, out=str(folder), **given), confirm)
     return StudyResult(root)

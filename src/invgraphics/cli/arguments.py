@@ -225,15 +225,32 @@ def parse_samples(count: int | None) -> int | None:
 
 
 def parse_list(text: str, option: str) -> tuple[str, ...]:
-    """Split a comma-separated list; commas within brackets do not separate.
+    """Split a comma-separated list; commas within brackets, braces and quotes do not separate.
 
     Raises:
         InputError: nothing in it.
     """
-    items = tuple(item.strip() for item in re.split(r",(?![^\[]*\])", text) if item.strip())
+    items = tuple(item.strip() for item in _split(text) if item.strip())
     if not items:
         raise InputError(f"{option} is empty.", "Expected one name or several, with commas between them.")
     return items
+
+
+def _split(text: str) -> list[str]:
+    """Parts between the commas of a list of TOML values that are in none of them."""
+    parts, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "\"'":
+            quote = letter
+        else:
+            depth += (letter in "[{") - (letter in "]}")
+        if letter == "," and depth <= 0 and not quote:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -13,6 +13,7 @@ from invgraphics.cli.report import write_report
 from invgraphics.experiments.request import CompareRequest
 from invgraphics.interruption import Terminated
 from invgraphics.recipes.recipe import expand, presets
+from invgraphics.runs.comparison import ComparisonRecord
 from invgraphics.runs.folder import RUNS, RunFolder
 
 
@@ -74,5 +75,5 @@ class Compare(Shared):
 
 
 def _report_what_is_finished(folder: Path) -> None:
-    if any(RunFolder(run).finished for run in folder.glob(f"{RUNS}/*/*")):
+    if RunFolder(folder).has(ComparisonRecord) and any(RunFolder(run).finished for run in folder.glob(f"{RUNS}/*/*")):
         write_report(folder)

@@ -23,6 +23,7 @@ FOR = {
     "sh_degree": ("ply", "spz"),
     "planes": ("mpi",),
     "view": ("mpi",),
+    "spz_version": ("spz",),
 }
 """Option -> what can be written that it does something for; exporters of other packages may take any."""
 IN_THE_WORLD = (".ply", ".obj")
@@ -66,6 +67,8 @@ class Export:
         str | None, arg(metavar="NAME", help_behavior_hint="(default: the mean of all, where they look one way)")
     ] = None
     """For mpi of a density: training view whose camera is the reference."""
+    spz_version: Annotated[int | None, arg(metavar="3|4", help_behavior_hint="(default: 4)")] = None
+    """For spz: version of the format; many viewers read up to 3 only."""
 
     def run(self) -> int:
         """Write the file and print facts about it; returns exit status 0."""

@@ -33,6 +33,9 @@ class ImportFile:
     three letters. Files that do not say (all but spz) are taken to be in the data set's world."""
     world: Annotated[str, arg(metavar="opencv|opengl|z-up|RDF")] = "opencv"
     """Where the axes of the data set's world point, for files with certain axes; opencv fits what converters write."""
+    transform: Annotated[str | None, arg(metavar="FILE.json", help_behavior_hint="(default: the same frame)")] = None
+    """Similarity from the data set's world to the file's frame: the dataparser_transforms.json that nerfstudio writes beside
+    its models (`transform`, 3 x 4, and `scale`), which its exported splats have had."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
     """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
@@ -69,7 +72,8 @@ class ImportFile:
             kernels=self.kernels,
             protocol=self.protocol,
         )
-        folder = import_run(ImportRequest(file=str(self.file), run=run, frame=self.frame, world=self.world))
+        request = ImportRequest(file=str(self.file), run=run, frame=self.frame, world=self.world, transform=self.transform)
+        folder = import_run(request)
         show_scores(RunFolder(folder).read_scores())
         print(folder)
         return 0

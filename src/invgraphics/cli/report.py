@@ -12,7 +12,8 @@ from tyro.conf import Positional, arg
 from invgraphics.cli.arguments import refuse_idle
 from invgraphics.cli.output import columns_that_fit, show_table
 from invgraphics.errors import InputError
-from invgraphics.runs.comparison import ComparisonRecord
+from invgraphics.runs.collection import runs_of
+from invgraphics.runs.comparison import ComparisonRecord, Failure
 from invgraphics.runs.folder import RUNS, RunFolder
 
 if TYPE_CHECKING:
@@ -55,11 +56,12 @@ class Report:
             write_report(first, out, self.public)
             return 0
         runs = [run for folder in self.folders for run in runs_in(folder)]
+        failures = [one for folder in self.folders for one in failures_in(folder)]
         if out is None:
             raise InputError("A report of single runs needs a folder to be written to.", "Give one with --out.")
         from invgraphics.report.build import build_from_runs
 
-        print(build_from_runs(runs, out, self.public))
+        print(build_from_runs(runs, out, self.public, failures))
         return 0
 
     def _study(self, folder: Path, out: Path | None) -> int:
@@ -101,11 +103,18 @@ def runs_in(folder: Path) -> list[Path]:
     """
     if RunFolder(folder).finished:
         return [folder]
+    if RunFolder(folder).has(ComparisonRecord):
+        return runs_of(folder)
     runs = sorted(run for run in folder.glob(f"{RUNS}/*/*") if RunFolder(run).finished)
-    if not runs and not RunFolder(folder).has(ComparisonRecord):
+    if not runs:
         remedy = "Give a folder that `invgraphics fit` or `invgraphics compare` wrote."
         raise InputError(f"There is no finished run in '{folder}'.", remedy)
     return runs
+
+
+def failures_in(folder: Path) -> tuple[Failure, ...]:
+    """Failed fits of a comparison; none of other folders."""
+    return RunFolder(folder).read(ComparisonRecord).failures if RunFolder(folder).has(ComparisonRecord) else ()
 
 
 def write_report(folder: Path, out: Path | None = None, public: bool = False) -> None:

@@ -13,7 +13,7 @@ from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.identity import run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import warn
-from invgraphics.experiments.renderings import is_kept, renderings_complete
+from invgraphics.experiments.renderings import is_kept_fit, render_missing, renderings_complete
 from invgraphics.experiments.request import CompareRequest, FitRequest
 from invgraphics.runs.folder import RUNS, RunFolder
 from invgraphics.runs.provenance import Provenance
@@ -43,20 +43,21 @@ def check_folders(request: CompareRequest) -> None:
             )
 
 
-def missing_fits(request: CompareRequest, jobs: Sequence[Job]) -> list[FitRequest]:
+def missing_fits(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> list[FitRequest]:
     """Fits to start: all, since each knows by itself whether it is finished, but those that are kept whatever the code.
 
-    Kept ones that the request's protocol has not scored yet are scored here, from their checkpoints.
+    Kept ones that the request's protocol has not scored, or its renderers have not shown, are so here, from their checkpoints.
     """
     methods = {job.request.method: job.method for job in jobs}
     missing = []
     for fit in request.fits():
         job = Job.of(fit, methods[fit.method])
-        if not (request.keep and is_kept(job)):
+        if not (request.keep and is_kept_fit(job)):
             missing.append(fit)
             continue
         for protocol in job.unscored():
             evaluate_run(job.folder.root, protocol=protocol)
+        render_missing(job, scene)
     return missing
 
 
@@ -81,7 +82,7 @@ def made_before(request: CompareRequest, jobs: Sequence[Job], scene: Scene | Non
     found, replaced = set(), 0
     for fit in request.fits():
         job = Job.of(fit, methods[fit.method])
-        if request.keep and is_kept(job):
+        if request.keep and is_kept_fit(job):
             found.add(fit.out)
         elif job.folder.finished and renderings_complete(job):
             truth = truth or truth_digest(scene)
@@ -97,4 +98,4 @@ def warn_of_replaced(count: int) -> None:
     """Warn of finished runs that are fitted again because code or pictures have changed, and name the way to keep them."""
     if count:
         what = "1 finished run is" if count == 1 else f"{count} finished runs are"
-        warn(f"{what} of other code or pictures, and fitted again; --keep keeps what other code made.")
+        warn(f"{what} of other code, packages or pictures, and fitted again; --keep keeps what other code or packages made.")

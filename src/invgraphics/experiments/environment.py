@@ -35,6 +35,12 @@ def code_version() -> str:
     return f"{version('invgraphics')}+{sha.hexdigest()[:12]}"
 
 
+def deciding_packages(device: torch.device) -> dict[str, str | None]:
+    """Versions of the packages that decide the bits of a fit on a device."""
+    names = ("numpy", "numba", *(CUDA_PACKAGES if device.type == "cuda" else ()))
+    return {"torch": torch.__version__} | {name: version(name) if find_spec(name) else None for name in names}
+
+
 @cache
 def commit(root: Path | None = None) -> str:
     """Git commit of the working copy that this package lies in, ``+ changes`` where tracked files differ from it; else empty.
@@ -90,7 +96,8 @@ def begun_by(before: Environment, code: str) -> Environment:
         before: that the fit's folder holds.
         code: in words.
     """
-    warn(f"Warning: the fit was begun by other code ({code}). The same command from the start may end elsewhere.")
+    what = f"Warning: the fit was begun by other code, threads or packages ({code})."
+    warn(f"{what} The same command from the start may end elsewhere.")
     return replace(before, begun_on=(*before.begun_on, f"code: {code}"))
 
 

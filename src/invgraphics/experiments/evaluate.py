@@ -21,7 +21,7 @@ from invgraphics.core.colour import linear_to_srgb, quantise
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.below_baseline import below_baseline, coverage_and_depth
 from invgraphics.experiments.clocks import PictureClock, disturbance, fit_costs
-from invgraphics.experiments.fitted import Fitted, load_fitted, open_fitted
+from invgraphics.experiments.fitted import Fitted, check_complete, load_fitted, open_fitted
 from invgraphics.experiments.identity import truth_digest
 from invgraphics.experiments.posed import PosedEvaluation, protocol_note, scene_in_fit_frame
 from invgraphics.experiments.progress import Reporter, warn
@@ -222,9 +222,10 @@ def evaluate_run(run: Path, scene_spec: str | None = None, protocol: str = "defa
     """Score a finished run or rendering again from its checkpoint, on its own scene or on another copy of it.
 
     Raises:
-        InputError: the folder holds no run, its checkpoint does not fit its recipe, or the scene has other test views.
+        InputError: the folder holds no finished run, its checkpoint does not fit, or the scene has other test views.
     """
     fitted = open_fitted(run, scene_spec)
+    check_complete(fitted.folder)
     with fitted.folder.held():
         return _evaluate_fitted(fitted, protocol)
 

@@ -22,6 +22,7 @@ from invgraphics.kernels.openmp import limit_spinning
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import RunFolder
+from invgraphics.runs.history import read_history
 from invgraphics.runs.provenance import Provenance
 from invgraphics.scenes.degrade import KEEP, TrainingData, degrade
 from invgraphics.scenes.open import SceneOptions, is_found, open_scene
@@ -150,3 +151,16 @@ def _method(folder: RunFolder, provenance: Provenance) -> Method:
         modules = ",".join(package.removeprefix("module ") for package in missing if package.startswith("module "))
         remedy = f"Set INVGRAPHICS_MODULES={modules} where it can be imported." if modules else "Install the package here."
         raise InputError(sentence, remedy) from error
+
+
+def check_complete(folder: RunFolder) -> None:
+    """Refuse an interrupted fit: scores would mark it as finished, so that it never went on.
+
+    Raises:
+        InputError: a part of its budget is not spent.
+    """
+    moments = read_history(folder.history) if folder.history.is_file() and not folder.finished else ()
+    progress = moments[-1].progress if moments else None
+    if progress is not None and progress < 1:
+        what = f"{folder.root} is not finished: {progress:.0%} of its budget are recorded."
+        raise InputError(what, "Give its command again with --resume; `invgraphics view` and `render` show it as it is.")

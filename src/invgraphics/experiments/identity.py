@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,16 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from invgraphics import plugins
+from invgraphics import kernels, plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.environment import code_version
+from invgraphics.experiments.environment import code_version, deciding_packages
 from invgraphics.experiments.job import Job
+from invgraphics.runs.environment import Environment
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import SCENE_COPY, SHARED_ABOVE, RunFolder
 from invgraphics.runs.provenance import Provenance
+from invgraphics.scenes.degrade import TrainingData
 from invgraphics.scenes.open import is_rendered
 from invgraphics.text import sha256_of
 from invgraphics.training.budget import Budget
@@ -75,8 +78,9 @@ def run_digest(job: Job, truth: str, threads: int) -> str:
             "recipe": method.digest,
             "truth": truth,
             "data": job.data.changes(),
-            "request": _fit_settings(job),
+            "request": _fit_settings(job) | {"kernels": job.request.kernels or kernels.in_use(job.device)},
             "code": code_version(),
+            "packages": deciding_packages(job.device),
             "threads": threads,
         }
     )
@@ -115,6 +119,8 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
         "training data": (found.data, job.data.changes()),
         "device": (found.device, str(job.device)),
     }
+    if request.kernels is not None and folder.has(Environment):
+        settings["kernels"] = (folder.read(Environment).kernels, request.kernels)
     if threads is not None and found.threads is not None:
         settings["number of threads"] = (found.threads, threads)
     if found.recipe_sha256 not in job.recipe_digests:
@@ -123,7 +129,15 @@ def check_replaceable(job: Job, threads: int | None = None) -> None:
         if theirs != ours:
             sentence = f"{folder.root} holds another run: its {name} is {theirs}, not {ours}."
             remedy = "Choose another --out, or delete that folder."
-            raise InputError(sentence, f"Give the same --set data.KEY=VALUE. {remedy}" if name == "training data" else remedy)
+            raise InputError(sentence, f"{_same_data(found.data, job)} {remedy}" if name == "training data" else remedy)
+
+
+def _same_data(found: Mapping[str, Any], job: Job) -> str:
+    """Remedy for another start of the same photographs, which `compare` may have chosen; of other data in general."""
+    ours = job.data.changes()
+    start = found.get("init", TrainingData.init)
+    same = {key: value for key, value in found.items() if key != "init"} == {k: v for k, v in ours.items() if k != "init"}
+    return f"Add --set data.init={start}." if same else "Give the same --set data.KEY=VALUE."
 
 
 def kept_scene(folder: RunFolder, name: str) -> Path | None:
@@ -166,16 +180,17 @@ def check_resumable(job: Job, scene: Scene, training_scene: Scene) -> None:
     if seen != (found.truth_sha256, found.train_sha256, found.cameras_sha256):
         raise InputError(f"{folder.root} holds a run of other pictures of the same scene.", other)
     if not job.request.keep:
-        raise InputError(
-            f"{folder.root} holds a run of other code, threads or kernels.", f"Add --keep to go on with it. {other}"
-        )
+        what = f"{folder.root} holds a run of other code, packages, threads or kernels, or from another source."
+        raise InputError(what, f"Add --keep to go on with it. {other}")
 
 
 def earlier_code(job: Job) -> str:
     """Code by which the folder's fit was made so far, in words: version of the sources, and plug-ins."""
     found = job.folder.read(Provenance)
     packages = ", ".join(sorted(set(found.plugins.values())))
-    ours = "the same invgraphics" if found.code_version == code_version() else f"invgraphics {found.code_version}"
+    same = found.code_version == code_version()
+    threads = "" if found.threads is None else f", {found.threads} thread{'s' if found.threads > 1 else ''}"
+    ours = f"{'the same ' if same else ''}invgraphics{'' if same else f' {found.code_version}'}{threads}"
     return f"{ours} with {packages}" if packages else ours
 
 

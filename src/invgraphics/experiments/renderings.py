@@ -70,9 +70,12 @@ def is_kept(job: Job) -> bool:
 
     Its folder, or `check_replaceable`, ensures that scene and request are the same.
     """
-    if not job.folder.finished or not renderings_complete(job):
-        return False
-    return job.folder.read(Provenance).recipe_sha256 in job.recipe_digests
+    return is_kept_fit(job) and renderings_complete(job)
+
+
+def is_kept_fit(job: Job) -> bool:
+    """The same, whatever renderings there are: they can be made from its checkpoint."""
+    return job.folder.finished and job.folder.read(Provenance).recipe_sha256 in job.recipe_digests
 
 
 def render_missing(job: Job, scene: Scene) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from invgraphics import plugins
+from invgraphics import kernels, plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
 from invgraphics.experiments.build import (
@@ -91,6 +91,7 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
     configure_torch(job.device)
     with folder.held(wait=request.existing == "reuse"):  # by a child of a killed comparison or study, which is about to end
         check_existing(job)
+        kernels.use(request.kernels)  # also for the scores and renderings of a fit that is finished
         scene = scene or open_with_progress(request.scene, job.options)
         check_variants(job.variants, [method], scene)
         training_scene = make_training_scene(job, scene)

@@ -25,6 +25,7 @@ from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder, check_run
 from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.scores import Scores
 from invgraphics.training.batches import Batches, size_of
 from invgraphics.training.fit import Fit, Plan
 
@@ -81,6 +82,8 @@ def resume(fit: Fit, job: Job) -> FitRecord:
         cause = " ".join(str(error).split())
         raise InputError(f"The checkpoint in {job.folder.root} does not fit the code of today: {cause}.") from error
     fit.resume_clocks(asdict(earlier))
+    for stale in job.folder.root.glob(Scores.FILES):  # of this checkpoint, under whatever protocol
+        stale.unlink(missing_ok=True)
     return earlier
 
 

@@ -91,14 +91,14 @@ def read_gaussians(path: Path) -> tuple[str, Splats]:
     raise InputError(f"'{path}' is no file of 3D Gaussians in a known format.", f"Known formats: {known}.")
 
 
-def write_gaussians(path: Path, name: str, splats: Splats) -> None:
-    """Write a file in the format ``name``, whole or not at all.
+def write_gaussians(path: Path, name: str, splats: Splats, **settings: int) -> None:
+    """Write a file in the format ``name``, whole or not at all; ``settings`` are those of its class, such as a version.
 
     Raises:
         InputError: the format is unknown or cannot be written, the file has another format's ending, there are no Gaussians, or
             they do not fit into the format.
     """
-    form = plugins.load("formats", name)()
+    form = plugins.load("formats", name)(**settings)
     if not isinstance(form, WritableFormat):
         raise InputError(f"The format '{name}' can only be read.")
     known = {suffix for other in plugins.names("formats") for suffix in plugins.load("formats", other).suffixes}

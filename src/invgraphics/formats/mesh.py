@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,8 @@ AXES = {".glb": "RUB"}
 """Axes of formats that name some: glTF is right, up, back. The others hold the data set's world."""
 UP = "z-up"
 """How the world's axes point for glTF, by default: +z is up (CONVENTIONS.md)."""
+WORLD_KEY = "invgraphics_world"
+"""In `asset.extras` of a GLB: the axes of the world from which it was turned to y-up."""
 LINEAR = "_LINEAR_RGB"
 """Second name of a GLB file's linear vertex colours, for readers that round ``COLOR_0`` to bytes and so lose dark ones."""
 
@@ -39,7 +43,7 @@ def check_suffix(path: Path) -> str:
     return suffix
 
 
-def write_mesh(path: Path, mesh: Mesh, rgb: Float[Tensor, "v 3"], comments: Sequence[str] = ()) -> None:
+def write_mesh(path: Path, mesh: Mesh, rgb: Float[Tensor, "v 3"], comments: Sequence[str] = (), world: str = UP) -> None:
     """Write a mesh whole or not at all; the format is that of the file's name.
 
     PLY has 8-bit colours and the comments, OBJ decimal colours behind the positions (as MeshLab and Blender read them), GLB
@@ -50,6 +54,7 @@ def write_mesh(path: Path, mesh: Mesh, rgb: Float[Tensor, "v 3"], comments: Sequ
         mesh: in the file's axes; its own colours are not looked at.
         rgb: colours of the vertices, display sRGB in [0, 1].
         comments: free text, one line each.
+        world: axes of the world from which a GLB was turned to y-up, which it keeps.
 
     Raises:
         InputError: the name has another ending, or the disk is full.
@@ -65,7 +70,8 @@ def write_mesh(path: Path, mesh: Mesh, rgb: Float[Tensor, "v 3"], comments: Sequ
     solid = Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), vertex_normals=normals, process=False)
     if suffix == ".glb":
         solid.vertex_attributes[LINEAR] = srgb_to_linear(rgb).numpy().astype(np.float32)
-        data = export_glb(solid, include_normals=normals is not None, tree_postprocessor=lambda tree: _finish(tree, comments))
+        finish = partial(_finish, comments=comments, world=world)
+        data = export_glb(solid, include_normals=normals is not None, tree_postprocessor=finish)
     else:
         bytes_ = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         solid.visual = ColorVisuals(solid, vertex_colors=bytes_)
@@ -79,8 +85,8 @@ def write_mesh(path: Path, mesh: Mesh, rgb: Float[Tensor, "v 3"], comments: Sequ
     write_bytes(path, data)
 
 
-def _finish(tree: dict[str, Any], comments: Sequence[str]) -> None:
-    """Name the colours, make the material unlit and two-sided, and say where the mesh comes from."""
+def _finish(tree: dict[str, Any], comments: Sequence[str], world: str) -> None:
+    """Name the colours, make the material unlit and two-sided, and say where the mesh comes from and how its world points."""
     primitive = tree["meshes"][0]["primitives"][0]
     primitive["attributes"]["COLOR_0"] = primitive["attributes"][LINEAR]
     primitive["material"] = 0
@@ -88,6 +94,7 @@ def _finish(tree: dict[str, Any], comments: Sequence[str]) -> None:
     tree["materials"] = [{"pbrMetallicRoughness": plain, "doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}]
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), "KHR_materials_unlit"})
     tree["asset"]["copyright"] = "; ".join(comments)
+    tree["asset"]["extras"] = {WORLD_KEY: world}
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -129,13 +136,28 @@ def _colours(loaded: Any, suffix: str) -> Float[Tensor, "v 3"] | None:
 
 
 def mesh_from_file(path: Path, scene: Scene) -> Mesh:
-    """Read a mesh file to a scene's local frame: PLY and OBJ are in the data set's world, GLB is y-up and the world z-up.
+    """Read a mesh file to a scene's local frame.
+
+    PLY and OBJ are in the data set's world. GLB is y-up; how the world points stands in files that were exported here, and is
+    taken to be z-up in others.
 
     Raises:
         InputError: it cannot be read.
     """
     axes = AXES.get(check_suffix(path))
-    similarity = torch.linalg.inv(scene.world_from_local.double())
+    similarity, mesh = torch.linalg.inv(scene.world_from_local.double()), read_mesh(path)
     if axes is not None:
-        similarity = similarity @ opencv_to_axes(UP) @ axes_to_opencv(axes)
-    return read_mesh(path).transformed(similarity)
+        similarity = similarity @ opencv_to_axes(_world_of(path)) @ axes_to_opencv(axes)
+    return mesh.transformed(similarity)
+
+
+def _world_of(path: Path) -> str:
+    """How the axes of the world point from which a GLB was written; `UP` where it does not say."""
+    data = path.read_bytes()
+    try:
+        length = int.from_bytes(data[12:16], "little")
+        world = json.loads(data[20 : 20 + length])["asset"]["extras"][WORLD_KEY]
+        axes_to_opencv(str(world))
+    except (ValueError, KeyError, TypeError, RecursionError, InputError):
+        return UP
+    return str(world)

@@ -27,6 +27,10 @@ OPACITY_EPS = 1e-7
 """Opacities are kept this far from 0 and 1, whose logits are infinite."""
 
 
+FILTERED = "Its 3D smoothing filter (filter_3D) was applied."
+"""Note of a file of Mip-Splatting or its successors, whose 2D filter (variance 0.1, with compensation) belongs to it."""
+
+
 @dataclass(frozen=True)
 class Ply:
     """Logits of opacities, logarithms of scales, quaternions (w, x, y, z); colour channels one after the other."""
@@ -61,7 +65,7 @@ class Ply:
         if not missing(table, FILTER):
             wide = torch.hypot(scales, columns(table, FILTER))
             scales, opacities = wide, opacities * (scales / wide.clamp_min(SMALLEST_SCALE)).prod(dim=1)
-            notes = (*notes, "Its 3D smoothing filter (filter_3D) was applied.")
+            notes = (*notes, FILTERED)
         gaussians = Gaussians(
             means=columns(table, POSITION),
             quaternions=columns(table, ROTATION),
@@ -69,7 +73,8 @@ class Ply:
             opacities=opacities,
             sh=coefficients(columns(table, DC), columns(table, rest) if rest else None),
         )
-        return Splats(gaussians, antialiased=True if any(ANTIALIASED in note for note in comments) else None, notes=notes)
+        compensated = FILTERED in notes or any(ANTIALIASED in note for note in comments)
+        return Splats(gaussians, antialiased=True if compensated else None, notes=notes)
 
     def write(self, path: Path, splats: Splats) -> None:
         """Write the standard properties in the standard order, 62 floats at degree 3; notes become comments."""

@@ -1,7 +1,8 @@
-"""SPZ (Niantic): attributes as bytes, compressed. Written in version 4 (Zstandard), read in versions 1 to 4 (before: gzip)."""
+"""SPZ (Niantic): attributes as bytes, compressed. Read in versions 1 to 3 (gzip) and 4 (Zstandard), written in 3 and 4."""
 
 from __future__ import annotations
 
+import gzip
 import struct
 import zlib
 from collections.abc import Iterator
@@ -19,6 +20,8 @@ from invgraphics.memory import check_fits, format_bytes
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 VERSION = 4
+WRITTEN = (3, 4)
+"""Versions that can be written: many viewers read up to 3 only."""
 MAX_DEGREE = 4
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, number of Gaussians, SH degree, fraction bits, flags, number of streams (version 4)."""
@@ -70,7 +73,13 @@ class Header:
 
 @dataclass(frozen=True)
 class Spz:
-    """About a tenth of a PLY file's size, at some loss."""
+    """About a tenth of a PLY file's size, at some loss.
+
+    Attributes:
+        version: that is written, one of `WRITTEN`.
+    """
+
+    version: int = VERSION
 
     suffixes: ClassVar[tuple[str, ...]] = (".spz",)
     flags_antialiasing: ClassVar[bool] = True
@@ -101,7 +110,7 @@ class Spz:
         return Splats(gaussians, axes, bool(header.flags & ANTIALIASED), tuple(notes))
 
     def write(self, path: Path, splats: Splats) -> None:
-        """Write version 4; ``splats`` are in the axes RUB.
+        """Write version 4 or, compressed by gzip, 3; ``splats`` are in the axes RUB.
 
         Raises:
             InputError: a Gaussian is too far from the origin.
@@ -111,10 +120,14 @@ class Spz:
         gaussians = splats.gaussians
         fraction = fraction_bits(gaussians.means)
         streams = [values.tobytes() for values in pack(gaussians, fraction).values() if values.size]
-        codec = pyarrow.Codec("zstd", compression_level=LEVEL)
-        packed = [codec.compress(stream, asbytes=True) for stream in streams]
         flags = ANTIALIASED if splats.antialiased else 0
         degree = harmonics.degree_of(gaussians.sh.shape[1])
+        if self.version < VERSION:
+            head = HEADER.pack(MAGIC, self.version, len(gaussians), degree, fraction, flags, 0)
+            path.write_bytes(gzip.compress(b"".join([head, *streams]), mtime=0))
+            return
+        codec = pyarrow.Codec("zstd", compression_level=LEVEL)
+        packed = [codec.compress(stream, asbytes=True) for stream in streams]
         head = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, fraction, flags, len(streams))
         contents = [STREAM.pack(len(small), len(large)) for small, large in zip(packed, streams, strict=True)]
         path.write_bytes(b"".join([head, EXTENDED.pack(HEADER.size + EXTENDED.size), *contents, *packed]))

@@ -127,8 +127,8 @@ def of_module(one: Registered) -> str:
 
 
 def names_in(table: Mapping[str, Any], method: str) -> set[str]:
-    """All ``type`` entries of a recipe, and its own name."""
-    used = {method}
+    """All ``type`` entries of a recipe, and its own name, without the changes that may follow it."""
+    used = {method, method.partition(":")[0]}
     waiting: list[Any] = [table]
     while waiting:
         part = waiting.pop()

@@ -18,6 +18,7 @@ from invgraphics.report.pages.longtable import write_comparison_table
 from invgraphics.report.pages.parts import draw_part, method_contrasts
 from invgraphics.report.pages.tables import effects_caption, write_latex, write_latex_effects
 from invgraphics.report.wording import listing
+from invgraphics.runs.comparison import Failure
 from invgraphics.runs.run import Run, read_run, truth_picture
 from invgraphics.text import common_value
 
@@ -39,13 +40,14 @@ def build_report(folder: Path, out: Path | None = None, public: bool = False) ->
     return _write(read_comparison(folder), folder if out is None else out, folder, public)
 
 
-def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Path:
+def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False, failures: Sequence[Failure] = ()) -> Path:
     """Write a report of any run folders; files that the page shows are copied into ``out`` unless they lie there already.
 
     Args:
         runs: run folders.
         out: folder to write; created where absent.
         public: leave out everything private.
+        failures: failed fits of the comparisons that the runs come from.
 
     Returns:
         The page, ``out/index.html``.
@@ -71,6 +73,7 @@ def build_from_runs(runs: Sequence[Path], out: Path, public: bool = False) -> Pa
         preset=common_value([run.scores.preset for run in labelled]),
         size=(picture.shape[1], picture.shape[0]),
         protocol={"name": first.scores.protocol},
+        failures=tuple(failures),
     )
     base = None if public else out
     return _write(comparison, out, base, public)
@@ -120,7 +123,8 @@ def _with_unique_names(runs: Sequence[Run]) -> list[Run]:
 def _settings(run: Run) -> tuple[str, ...]:
     """Everything that runs of one name must share."""
     data = json.dumps(run.provenance.data, sort_keys=True)
-    return run.method, run.provenance.recipe_sha256, run.scores.preset, run.provenance.budget, data
+    made = run.provenance
+    return run.method, made.recipe_sha256, run.scores.preset, made.budget, data, made.device
 
 
 def _named(groups: Sequence[list[Run]]) -> Iterator[tuple[list[Run], str]]:

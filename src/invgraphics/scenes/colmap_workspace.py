@@ -11,7 +11,7 @@ from typing import Any
 from invgraphics.errors import InputError
 from invgraphics.scenes.colmap_sizes import check_sizes, names_in_text
 from invgraphics.scenes.layout import IMAGE_FOLDERS, is_image_folder
-from invgraphics.scenes.pictures.images import file_exists
+from invgraphics.scenes.pictures.images import file_exists, image_files
 
 PLACES = ("sparse/0", "sparse", "sparse/*", "colmap/sparse", "colmap/sparse/*", ".", "[0-9]", "[0-9][0-9]")
 UNDISTORTED = ("dense/sparse", "dense/*/sparse", "undistorted/sparse", "[0-9]/sparse", "dense/*", "dense")
@@ -136,8 +136,25 @@ def _read(folder: Path, given: Path) -> Model:
         raise InputError(f"The COLMAP model {folder} has an image whose name is no text in UTF-8.", "Rename it.") from error
     candidates = [replace(bare, images=images, present=_present(images, names)) for images in _image_folders(folder)]
     asked = [model for model in candidates if model.present and _is_given(model, given)]
+    if not asked and is_image_folder(given) and any(_is_given(model, given) for model in candidates):
+        asked = [_renamed(bare, given)] if image_files(given) else []
     fullest = max(asked or candidates, key=lambda model: model.present, default=bare)  # of equal ones, the nearest
     return fullest if fullest.present else bare
+
+
+def _renamed(model: Model, folder: Path) -> Model:
+    """The model with the photographs of a folder in which they have other names, in the order of names (LLFF's scaled copies).
+
+    Raises:
+        InputError: there are more or fewer than the model lists.
+    """
+    images, files = sorted(model.reconstruction.images.values(), key=lambda image: image.name), sorted(image_files(folder))
+    if len(images) != len(files):
+        what = f"{folder} has none of the {len(images)} photographs that {model.folder} lists, and {len(files)} of other names."
+        raise InputError(what, f"The first one listed is '{images[0].name}'.")
+    for image, file in zip(images, files, strict=True):
+        image.name = file.name
+    return replace(model, images=folder, present=len(model.registered))
 
 
 def _present(folder: Path, names: Sequence[str]) -> int:
@@ -148,8 +165,11 @@ def parents_in_workspace(model: Path) -> list[Path]:
     """A model's folder, and those above it up to the one that holds ``sparse`` or ``colmap/sparse``."""
     base = _absolute(model)
     bases = [base]
-    for convention in (str.isdecimal, "sparse".__eq__, "colmap".__eq__):
-        if convention(base.name):
+    if base.name.isdecimal() or base.parent.name == "sparse":  # sparse/0, sparse/aligned
+        base = base.parent
+        bases.append(base)
+    for name in ("sparse", "colmap"):
+        if base.name == name:
             base = base.parent
             bases.append(base)
     return bases

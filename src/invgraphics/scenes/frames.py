@@ -15,6 +15,7 @@ from invgraphics.core import Camera
 from invgraphics.core.believable import LONGEST_SIDE
 from invgraphics.core.transforms import focal_from_fov, opengl_to_opencv
 from invgraphics.errors import InputError
+from invgraphics.scenes.layout import IMAGE_FOLDERS
 from invgraphics.scenes.pictures.images import SUFFIXES, Photo, file_exists, stored_size
 from invgraphics.scenes.pictures.lens import Lens
 from invgraphics.scenes.poses import pose
@@ -192,6 +193,11 @@ def _find(folder: Path, file_path: str) -> Path:
     path = folder / file_path.replace("\\", "/")
     if file_exists(path):
         return path
+    first, *rest = photo_name(file_path).split("/")
+    if first == IMAGE_FOLDERS[0] and rest and not (folder / first).is_dir():  # scaled copies alone were kept
+        copies = [folder.joinpath(name, *rest) for name in IMAGE_FOLDERS if name.startswith(f"{first}_")]
+        if found := next((copy for copy in copies if file_exists(copy)), None):
+            return found
     for suffix in SUFFIXES:
         for candidate in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
             if file_exists(candidate):

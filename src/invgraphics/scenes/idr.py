@@ -25,6 +25,9 @@ from invgraphics.scenes.region import NEAR, LocalFrame
 
 _NAMES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 
+OFF_CENTRE = 0.8
+"""Share of the picture's width and height beyond which no lens has its centre: of pictures at half of their size it is at 1."""
+
 
 class Idr:
     """Loader of ``cameras*.npz``: projection matrices ``world_mat_i`` and the subject's sphere ``scale_mat_i``.
@@ -84,7 +87,21 @@ def _cameras(source: Path, files: list[Path]) -> tuple[Float[Tensor, "4 4"], lis
             raise InputError(f"{source} has a scale_mat_{index} that differs from scale_mat_0.", "One sphere is expected.")
         camera = decompose(_matrix(arrays, f"world_mat_{index}", source)[:3], stored_size(file), f"{source}, world_mat_{index}")
         cameras.append(camera)
+    _check_centres(cameras, source)
     return world_from_local, cameras
+
+
+def _check_centres(cameras: list[Camera], source: Path) -> None:
+    """Refuse pictures that were resized without their matrices, which hold no size.
+
+    Raises:
+        InputError: in most views the principal point lies near or beyond the same end of both sides.
+    """
+    places = [camera.principal_point / torch.tensor([camera.width, camera.height]) for camera in cameras]
+    x, y = torch.stack(places).median(dim=0).values.tolist()
+    if min(x, y) > OFF_CENTRE or max(x, y) < 1 - OFF_CENTRE:
+        what = f"The principal points of {source} lie at {x:.2f} of the pictures' width and {y:.2f} of their height"
+        raise InputError(f"{what}: pictures were resized without their matrices.", "Use those of the full size, and --size.")
 
 
 def _numbers(arrays: Mapping[str, np.ndarray], files: list[Path], source: Path) -> list[int]:

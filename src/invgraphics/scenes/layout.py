@@ -92,8 +92,8 @@ def scene_name(path: Path) -> str:
     """Name of a data set: of the first folder upwards that is not conventional (``sparse/0``, ``images``)."""
     folder = path.resolve()
     for each in (folder, *folder.parents):
-        numbered = each.name.isdecimal() and each.parent.name in _HOLDERS
-        if each.name and not numbered and each.name not in _HOLDERS and not is_image_folder(each):
+        model = (each.name.isdecimal() and each.parent.name in _HOLDERS) or each.parent.name == "sparse"
+        if each.name and not model and each.name not in _HOLDERS and not is_image_folder(each):
             return each.name
     return folder.name or "scene"
 

@@ -30,7 +30,7 @@ from invgraphics.runs.study import CellRecord
 from invgraphics.scenes.open import missing_data_reason
 from invgraphics.studies.analyses import write_analyses
 from invgraphics.studies.cells import Planned, make_plan, select
-from invgraphics.studies.forecast import Cost, Forecast, total, try_method
+from invgraphics.studies.forecast import Cost, Forecast, limited_threads, total, try_method
 from invgraphics.studies.reading import locate, name_of, read_study, with_request
 from invgraphics.studies.record import CellState, StudyRecorder, summarise_study
 from invgraphics.studies.study import Study
@@ -100,10 +100,11 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
         _check_threads(missing, threads)
         warn_of_replaced(sum(_is_replaced(planned, truths[_truth_key(planned)], threads) for planned in missing))
-        costs = _try_methods(missing, trials)
+        costs = _try_methods(missing, trials, threads)
         missing.sort(key=lambda planned: _execution_order(planned, study, costs))
         expected = {planned.id: costs[_cost_key(planned)].seconds(planned.job.budget) for planned in missing}
-        later = sum(state.status in ("later", "skipped") for state in states.values())
+        left = [fits[name] for name, state in states.items() if state.status in ("later", "skipped")]
+        later = sum(not planned.job.folder.finished for planned in left)
         forecast = total([(costs[_cost_key(p)], p.job.budget) for p in missing], len(fits), request.jobs, later)
         _check_disk(forecast, folder.root)
         for sentence in announcements(planned.method.choice for planned in plan):
@@ -199,12 +200,13 @@ def _check_threads(missing: Sequence[Planned], threads: int) -> None:
                 raise InputError(error.sentence, remedy) from error
 
 
-def _try_methods(missing: Sequence[Planned], trials: Trials) -> dict[tuple[str, str, Size], Cost]:
-    """Measure the cost of a run of each method with each preset at each size, by its first cell."""
+def _try_methods(missing: Sequence[Planned], trials: Trials, threads: int) -> dict[tuple[str, str, Size], Cost]:
+    """Measure the cost of a run of each method with each preset at each size, by its first cell, with a run's threads."""
     costs: dict[tuple[str, str, Size], Cost] = {}
-    for planned in missing:
-        if _cost_key(planned) not in costs:
-            costs[_cost_key(planned)] = try_method(*trials[_cost_key(planned)])
+    with limited_threads(threads):
+        for planned in missing:
+            if _cost_key(planned) not in costs:
+                costs[_cost_key(planned)] = try_method(*trials[_cost_key(planned)])
     return costs
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+
+import torch
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
@@ -84,6 +87,21 @@ class Forecast:
         runs = f"{self.runs} runs, {self.runs - self.missing - self.later} of them finished"
         runs += f", {self.later} left out" if self.later else ""
         return f"{runs}; the rest takes about {duration(self.seconds)} and {self.size / 1e9:.2g} GB."
+
+
+@contextmanager
+def limited_threads(count: int) -> Iterator[None]:
+    """Give torch's and Numba's pools so many threads, as a run that shares the machine has; what they had comes back."""
+    import numba
+
+    before = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(count)
+    numba.set_num_threads(min(count, before[1]))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
 
 
 def try_method(job: Job, scene: Scene) -> Cost:

@@ -17,6 +17,7 @@ from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.gaussian import FixedGaussians
 from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import ANTIALIASED, Splats, read_gaussians, write_gaussians
+from invgraphics.formats.spz import WRITTEN
 from invgraphics.runs.folder import output_file
 from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_file
 
@@ -43,6 +44,7 @@ class ExportRequest:
             readers of the format expect: 3 for PLY, elsewhere the run's own.
         planes: number of planes that a density is sliced into; ``None`` for `PLANES`.
         view: training view whose camera is the reference of a multi-plane image; ``None`` for the mean of all.
+        spz_version: of an SPZ file, 3 or 4; ``None`` for 4.
     """
 
     run: Path
@@ -55,6 +57,7 @@ class ExportRequest:
     sh_degree: int | None = None
     planes: int | None = None
     view: str | None = None
+    spz_version: int | None = None
 
     def __post_init__(self) -> None:
         low, high = PLANES_RANGE
@@ -62,6 +65,8 @@ class ExportRequest:
             raise InputError(f"--planes cannot be {self.planes}.", f"Expected {low} to {high}.")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= harmonics.MAX_DEGREE:
             raise InputError(f"--sh-degree cannot be {self.sh_degree}.", f"Expected 0 to {harmonics.MAX_DEGREE}.")
+        if self.spz_version is not None and self.spz_version not in WRITTEN:
+            raise InputError(f"--spz-version cannot be {self.spz_version}.", f"Expected {' or '.join(map(str, WRITTEN))}.")
         low, high = RESOLUTIONS
         if self.resolution is not None and not low <= self.resolution <= high:
             raise InputError(f"--resolution cannot be {self.resolution}.", f"Expected a number of voxels, {low} to {high}.")
@@ -109,7 +114,8 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     flagged = getattr(plugins.load("formats", request.to), "flags_antialiasing", False)
     shown += f"; {ANTIALIASED}" if antialiased else ""
     note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
-    write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)))
+    settings = {} if request.spz_version is None else {"version": request.spz_version}
+    write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)), **settings)
 
     _, written = read_gaussians(request.out)
     back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, world).float())

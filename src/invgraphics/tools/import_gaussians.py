@@ -8,6 +8,8 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import torch
+
 from invgraphics.core import Gaussians, Scene, harmonics
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, configure_torch, open_with_progress, use_kernels
@@ -19,7 +21,7 @@ from invgraphics.experiments.run import write_description
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
 from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import SMALLEST_SCALE, Splats, read_gaussians
-from invgraphics.formats.ply import OPACITY_EPS
+from invgraphics.formats.ply import FILTERED, OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
@@ -27,10 +29,14 @@ from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment
 from invgraphics.runs.provenance import ImportedFile, Provenance
 from invgraphics.text import sha256_of
-from invgraphics.tools.file_frames import WORLD, local_from_file
+from invgraphics.tools.file_frames import WORLD, file_from_world, local_from_file
 
 IMPORTED = "imported"
 """What stands where a fit's budget and preset would."""
+TURNING = ("Nerfstudio", "Nerstudio")
+"""Tools, as comments in their files name them, that turn, centre and scale the data set's world."""
+LEAST_SEEN, MOST_CAMERAS = 0.5, 32
+"""Share of the Gaussians in one of so many training pictures below which they are probably in another frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,17 +49,25 @@ class ImportRequest:
         frame: axes of the file, as `core.transforms.axes_to_opencv` reads them; ``None`` for what the file says, else for the
             world's own.
         world: how the axes of the data set's world point, for files that have certain axes.
+        transform: JSON of the similarity from the data set's world to the file's frame, as nerfstudio writes it
+            (``dataparser_transforms.json``); ``None`` where they are the same.
     """
 
     file: str
     run: FitRequest
     frame: str | None = None
     world: str = WORLD
+    transform: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.frame is not None and self.transform is not None:
+            raise InputError("--frame and --transform both say where the file's axes point.", "Give one of them.")
 
     def shell(self) -> str:
         """Shell command that reproduces this import."""
         placed = ["--frame", self.frame] if self.frame else []
         placed += ["--world", self.world] if self.world != WORLD else []
+        placed += ["--transform", self.transform] if self.transform else []
         given = self.run.flags()
         where = given.index("--budget")
         del given[where : where + 2]
@@ -75,15 +89,19 @@ def import_run(request: ImportRequest) -> Path:
     folder = job.folder
     _check_empty(folder)  # before the work, and again under the lock
     scene = open_with_progress(job.request.scene, job.options)
-    gaussians = transform_gaussians(splats.gaussians, local_from_file(scene, axes, request.world).float())
+    place = local_from_file(scene, axes, request.world)
+    if request.transform is not None:
+        place = place @ torch.linalg.inv(file_from_world(Path(request.transform), job.request.scene))
+    gaussians = transform_gaussians(splats.gaussians, place.float())
+    _warn_of_frame(gaussians, scene, splats, request)
     folder.create()
     configure_torch(job.device)
     use_kernels(job.request.kernels, job.device)
     origin = _origin(request, name, splats, axes)
     if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
-        print(
-            "The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true shows it so.", file=sys.stderr
-        )
+        also = " --set renderer.dilation=0.1" if FILTERED in splats.notes else ""
+        what = f"The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true{also} shows it so."
+        print(what, file=sys.stderr)
     with folder.held():
         _check_empty(folder)
         folder.clear()
@@ -99,6 +117,19 @@ def import_run(request: ImportRequest) -> Path:
         for protocol in job.protocols:
             evaluate(folder, scene, model, protocol, costs, job.method)
     return folder.root
+
+
+def _warn_of_frame(gaussians: Gaussians, scene: Scene, splats: Splats, request: ImportRequest) -> None:
+    """Warn where the Gaussians are not where the cameras look, or come from a tool that turns and scales the world."""
+    seen = torch.zeros(len(gaussians), dtype=torch.bool)
+    for view in scene.train[:: max(1, len(scene.train) // MOST_CAMERAS)]:
+        seen |= view.camera.pixel_of(gaussians.means)[0]
+    share = float(seen.float().mean())
+    maker = next((name for name in TURNING if any(name.lower() in note.lower() for note in splats.notes)), "")
+    if share < LEAST_SEEN or (maker and request.transform is None):
+        why = f"{maker} writes files in a frame of its own" if maker else "it may be in a frame of its own"
+        what = f"Warning: {share:.0%} of the Gaussians lie in a training picture; {why}."
+        print(f"{what} --transform dataparser_transforms.json, or --frame, places it.", file=sys.stderr)
 
 
 def _check_empty(folder: RunFolder) -> None:
@@ -143,6 +174,7 @@ def fill(field: GaussianField, gaussians: Gaussians) -> None:
 
 def _origin(request: ImportRequest, name: str, splats: Splats, axes: str | None) -> ImportedFile:
     path = Path(request.file)
+    placed = () if request.transform is None else (f"Placed by the similarity {Path(request.transform).read_text().strip()}.",)
     return ImportedFile(
         file=request.file,
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -153,7 +185,7 @@ def _origin(request: ImportRequest, name: str, splats: Splats, axes: str | None)
         gaussians=len(splats.gaussians),
         sh_degree=harmonics.degree_of(splats.gaussians.sh.shape[1]),
         antialiased=splats.antialiased,
-        notes=splats.notes,
+        notes=(*splats.notes, *placed),
     )
 
 

@@ -43,7 +43,7 @@ def export_mesh(fitted: Fitted, request: ExportRequest) -> Exported:
     world = (request.world or UP) if axes else UP
     note = f"invgraphics: {fitted.method.name} on {scene.name}, in {_frame(axes)}; {how}"
     rgb = linear_to_srgb(mesh.rgb) if scene.colour == "linear" else mesh.rgb
-    write_mesh(request.out, mesh.transformed(file_from_local(scene, axes, world)), rgb.clamp(0, 1), (note,))
+    write_mesh(request.out, mesh.transformed(file_from_local(scene, axes, world)), rgb.clamp(0, 1), (note,), world)
     open_edges = mesh.open_edges()
     facts = {
         "vertices": f"{len(mesh.vertices):,}",

@@ -83,6 +83,8 @@ class FitProcess:
         try:
             return str(read_json(self._report)["error"])
         except (InputError, KeyError, TypeError):
+            if status == -signal.SIGKILL:
+                return "The process was killed and left no message, as where memory runs out. Try a smaller --size."
             return f"The process ended with status {status} and left no message."
 
 

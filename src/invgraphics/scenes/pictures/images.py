@@ -105,7 +105,7 @@ def stored_size(path: Path) -> tuple[int, int]:
         return _stored_size(image)
 
 
-def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w c"]:
+def read_pixels(path: Path, like: tuple[int, int] | None = None, *, clip: bool = False) -> UInt8[np.ndarray, "h w c"]:
     """Read a photograph as 8-bit colour: upright, or, where its camera is known, as that was calibrated.
 
     Sixteen-bit greys are rounded, palettes and greys become RGB. Structure from motion reads pixels as they are stored
@@ -114,6 +114,7 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
     Args:
         path: the file.
         like: the camera's (width, height), if it is known.
+        clip: whether sixteen-bit greys are cut off at 255 instead: numbers of labels.
 
     Returns:
         Straight colour with 3 channels, or 4 where the file has an alpha channel.
@@ -126,7 +127,8 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None) -> UInt8[np.nda
             raise ValueError(wrong)
         turned = _loaded(image, upright=like is None or _is_turned(image, like))
         if turned.mode.startswith("I"):
-            grey = (np.asarray(turned).astype(np.float64) / 257 + 0.5).clip(0, 255).astype(np.uint8)
+            levels = np.asarray(turned).astype(np.float64)
+            grey = (levels if clip else levels / 257 + 0.5).clip(0, 255).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
         clear = turned.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in turned.info
         return np.array(turned.convert("RGBA" if clear else "RGB"))

@@ -16,6 +16,8 @@ from invgraphics.scenes.pictures.resize import area_resize
 
 FOLDER = "masks"
 """Where masks lie beside a folder of photographs."""
+LOSSY = (".jpg", ".jpeg", ".webp")
+"""Endings of formats in which black is not exactly 0. In others any number above counts, as for COLMAP and nerfstudio."""
 WHOLE = 1 - 1e-6
 """Valid share of what a pixel covers from which on it is valid: all of it, up to rounding."""
 
@@ -50,7 +52,9 @@ def mask_of(name: str, folder: Path) -> Path | None:
 
 
 def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Read a mask as a picture of a size: 255 where pixels are valid, which is where it is brighter than half of its maximum.
+    """Read a mask as a picture of a size: 255 where pixels are valid, which is where they are not black.
+
+    In lossy formats they are valid where they are brighter than half of the maximum.
 
     Args:
         mask: the file; of a larger one than the photograph all pixels that a photograph's covers must be valid, of a smaller
@@ -61,13 +65,13 @@ def read_mask(mask: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]
     Raises:
         InputError: it is missing or no picture, has another shape than the photograph, or masks all of it.
     """
-    values = brightness(read_pixels(mask, (width, height)))
+    values = brightness(read_pixels(mask, (width, height), clip=True))
     high, wide = values.shape
     if abs(wide * height - high * width) > max(width, height, wide, high):
         raise InputError(f"{mask} has {wide}x{high} pixels, its photograph has {width}x{height}.")
     if not values.any():
         raise InputError(f"{mask} is black: no pixel of its photograph counts.", "Leave the photograph out, or its mask.")
-    bright = values > values.max() // 2
+    bright = values > (values.max() // 2 if mask.suffix.lower() in LOSSY else 0)
     if wide >= width and high >= height:
         valid = area_resize(bright[..., None].astype(np.float64), width, height)[..., 0] > WHOLE
     else:
