@@ -271,4 +271,4 @@ def test_commas_within_values_do_not_separate_names() -> None:
     sampler = 'volumetric/hash:renderer.sampler={type="stratified",samples=64}'
     lists = "volumetric/nerf:hooks=[[1,2],[3,4]]"
     quoted = "a:b='x,y'"
-    assert parse_list(f"{sampler},{lists},{quoted}, c", "--methods") == (sampler, lists, quoted, "c")
+    assert arguments.parse_list(f"{sampler},{lists},{quoted}, c", "--methods") == (sampler, lists, quoted, "c")

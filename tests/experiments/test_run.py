@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -347,9 +348,8 @@ def test_a_fit_goes_on_by_other_code_where_that_is_asked_for(
     for _ in range(2):  # the second time the code is the same
         fit_run(_request(toy_folder, folder, existing="resume", keep=True))
         found = json.loads((folder / "environment.json").read_text())
-        assert found["begun_on"] == [
-            f"code: invgraphics {before['code_version']}, {torch.get_num_threads()} thread{'s' * (torch.get_num_threads() > 1)}"
-        ]
+        assert len(found["begun_on"]) == 1
+        assert re.fullmatch(rf"code: invgraphics {re.escape(before['code_version'])}, \d+ threads?", found["begun_on"][0])
         (folder / "scores.json").unlink()
     after = json.loads((folder / "provenance.json").read_text())
     assert after["code_version"] == "9.9+later" and after["cell_sha256"] != before["cell_sha256"]
