@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 from PIL import Image
 
 from invgraphics.cli import main
-from invgraphics.cli.report import runs_in
+from invgraphics.cli.report import failures_in, runs_in
 from invgraphics.errors import InputError
+from invgraphics.runs.comparison import ComparisonRecord, Failure
+from invgraphics.runs.folder import RunFolder
 
 SIZE = 16
 
@@ -98,5 +101,14 @@ def test_compare_then_evaluate_and_report(tmp_path, capsys, request) -> None:
 def test_folders_without_runs_are_told_apart(tmp_path) -> None:
     with pytest.raises(InputError, match="no finished run"):
         runs_in(tmp_path)
-    (tmp_path / "compare.json").write_text("{}")
+    for seed in (0, 1):
+        (tmp_path / "runs" / "a" / f"seed-{seed}").mkdir(parents=True)
+        (tmp_path / "runs" / "a" / f"seed-{seed}" / "scores.json").write_text("{}")
+    assert len(runs_in(tmp_path)) == 2
+    lost = Failure(method="a", seed=2, error="Boom.")
+    record = ComparisonRecord(scene="s", methods=("a",), runs=("runs/a/seed-1",), failures=(lost,))
+    RunFolder(tmp_path).write(record)
+    assert runs_in(tmp_path) == [tmp_path / "runs" / "a" / "seed-1"]  # seed 0 is of another command
+    assert [(one.seed, one.error) for one in failures_in(tmp_path)] == [(2, "Boom.")]
+    RunFolder(tmp_path).write(replace(record, runs=()))
     assert runs_in(tmp_path) == []  # a comparison all of whose fits failed has a report as well

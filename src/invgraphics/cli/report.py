@@ -12,9 +12,9 @@ from tyro.conf import Positional, arg
 from invgraphics.cli.arguments import refuse_idle
 from invgraphics.cli.output import columns_that_fit, show_table
 from invgraphics.errors import InputError
-from invgraphics.runs.collection import runs_of
 from invgraphics.runs.comparison import ComparisonRecord, Failure
 from invgraphics.runs.folder import RUNS, RunFolder
+from invgraphics.runs.inside import inside
 
 if TYPE_CHECKING:
     from invgraphics.report.statistics.summary import Cell, Summary
@@ -104,7 +104,7 @@ def runs_in(folder: Path) -> list[Path]:
     if RunFolder(folder).finished:
         return [folder]
     if RunFolder(folder).has(ComparisonRecord):
-        return runs_of(folder)
+        return [inside(folder, name) for name in RunFolder(folder).read(ComparisonRecord).runs]
     runs = sorted(run for run in folder.glob(f"{RUNS}/*/*") if RunFolder(run).finished)
     if not runs:
         remedy = "Give a folder that `invgraphics fit` or `invgraphics compare` wrote."

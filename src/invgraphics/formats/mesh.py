@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from invgraphics.core.colour import linear_to_srgb, srgb_to_linear
 from invgraphics.core.transforms import axes_to_opencv, opencv_to_axes
 from invgraphics.errors import InputError
 from invgraphics.files import write_bytes
+from invgraphics.tables import parse_json
 
 SUFFIXES = (".glb", ".obj", ".ply")
 AXES = {".glb": "RUB"}
@@ -156,8 +156,8 @@ def _world_of(path: Path) -> str:
     data = path.read_bytes()
     try:
         length = int.from_bytes(data[12:16], "little")
-        world = json.loads(data[20 : 20 + length])["asset"]["extras"][WORLD_KEY]
+        world = parse_json(data[20 : 20 + length].decode(), str(path))["asset"]["extras"][WORLD_KEY]
         axes_to_opencv(str(world))
-    except (ValueError, KeyError, TypeError, RecursionError, InputError):
+    except (ValueError, KeyError, TypeError, InputError):
         return UP
     return str(world)
