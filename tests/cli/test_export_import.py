@@ -266,7 +266,9 @@ def test_a_file_in_nerfstudio_s_frame_is_placed_by_its_transform(
     assert main.run(["import", str(placed), *words, "--out", str(tmp_path / "lost")]) == main.DONE
     assert re.search(r"Warning: \d% of the Gaussians lie in a training picture; it may be in a frame", capsys.readouterr().err)
     assert _quality(tmp_path / "lost")["psnr"] < own - 3
-    for bad, said in (({"scale": 1}, "is no finite matrix"), (table | {"scale": 0}, "is 0, no positive number")):
+    mirrored = {"transform": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}
+    wrong = (({"scale": 1}, "is no finite matrix"), (table | {"scale": 0}, "is 0, no positive number"), (mirrored, "mirrors"))
+    for bad, said in wrong:
         (tmp_path / "bad.json").write_text(json.dumps(bad))
         assert main.run(["import", str(placed), *words, "--transform", str(tmp_path / "bad.json")]) == main.BAD_INPUT
         assert said in capsys.readouterr().err

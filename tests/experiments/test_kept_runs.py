@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from made_up_runs import provenance_table
-from training_fixtures import SMALL
+from training_fixtures import SMALL, InProcess
 
 from invgraphics.errors import InputError
 from invgraphics.experiments.compare import compare
@@ -95,3 +95,19 @@ def test_a_comparison_that_is_interrupted_lists_no_run_of_earlier_code(
     assert found == (["seed-0", "seed-1"] if keep else ["seed-1"])
     replaced = "1 finished run is of other code, packages or pictures, and fitted again; --keep keeps what other"
     assert (replaced in capsys.readouterr().err) is not keep
+
+
+def test_a_kept_fit_is_shown_by_another_renderer_without_a_new_fit(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: type[InProcess]
+) -> None:
+    """The code has changed, and the second command asks for pictures that the first did not."""
+    shared = {"scene": str(toy_folder), "out": str(tmp_path), "methods": (METHOD,), "budget": "2steps"}
+    first = CompareRequest(**shared, overrides=tuple(SMALL[METHOD]))
+    compare(first)
+    (run,) = [Path(fit.out) for fit in first.fits()]
+    before = (run / "checkpoint.safetensors").read_bytes()
+    monkeypatch.setattr("invgraphics.experiments.identity.code_version", lambda: "9.9+later")
+    in_process.made.clear()
+    compare(CompareRequest(**shared, overrides=tuple(SMALL[METHOD]), render_with=("gaussian-volume/exact:steps=8",), keep=True))
+    assert not in_process.made and (run / "checkpoint.safetensors").read_bytes() == before
+    assert len(json.loads((run / "renderings.json").read_text())["renderings"]) == 2

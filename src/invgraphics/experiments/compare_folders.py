@@ -57,7 +57,8 @@ def missing_fits(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> 
             continue
         for protocol in job.unscored():
             evaluate_run(job.folder.root, protocol=protocol)
-        render_missing(job, scene)
+        with job.folder.held():
+            render_missing(job, scene)
     return missing
 
 

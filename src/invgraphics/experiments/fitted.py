@@ -149,7 +149,11 @@ def _method(folder: RunFolder, provenance: Provenance) -> Method:
         names = ", ".join(f"'{name}'" for name, package in used.items() if package in missing)
         sentence = f"{folder.root} was made with {', '.join(missing)}, which provides {names} and is not installed here."
         modules = ",".join(package.removeprefix("module ") for package in missing if package.startswith("module "))
-        remedy = f"Set INVGRAPHICS_MODULES={modules} where it can be imported." if modules else "Install the package here."
+        remedy = "Install the package here."
+        if modules:
+            remedy = f"Set INVGRAPHICS_MODULES={modules} where it can be imported."
+        elif plugins.ANONYMOUS in missing:
+            remedy = "Register the parts again by ig.register."
         raise InputError(sentence, remedy) from error
 
 

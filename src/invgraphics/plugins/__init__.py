@@ -14,6 +14,7 @@ from invgraphics.plugins.lookup import load_all as load_all
 from invgraphics.plugins.lookup import name_of as name_of
 from invgraphics.plugins.lookup import names as names
 from invgraphics.plugins.lookup import origin as origin
+from invgraphics.plugins.registered import ANONYMOUS as ANONYMOUS
 from invgraphics.plugins.registered import MODULES as MODULES
 from invgraphics.plugins.registered import check_importable as check_importable
 from invgraphics.plugins.registered import environment as environment

@@ -19,6 +19,8 @@ MODULES = "INVGRAPHICS_MODULES"
 """Environment variable: modules, with commas between them, that are imported because they `register` parts."""
 SCRIPT = "__main__"
 """Module of scripts and notebooks, which other processes cannot import."""
+ANONYMOUS = "a script or notebook"
+"""Stands for their name in records."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def check_importable(table: Mapping[str, Any], method: str = "") -> None:
 
 def of_module(one: Registered) -> str:
     """Where a part was registered, in words."""
-    return "a script or notebook" if one.module == SCRIPT else f"module {one.module}"
+    return ANONYMOUS if one.module == SCRIPT else f"module {one.module}"
 
 
 def names_in(table: Mapping[str, Any], method: str) -> set[str]:

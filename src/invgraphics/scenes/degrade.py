@@ -51,9 +51,8 @@ class TrainingData:
         photo_noise: standard deviation of Gaussian noise on each channel, as a share of white.
         exposure: standard deviation, in stops, of each photograph's exposure, applied to linear light.
         background: ``random`` keeps the photographs' alpha; a colour (``white``, ``grey``, ``black`` or [r, g, b] in [0, 1])
-            puts every photograph in front of it and drops the alpha, and the fit composites over the same colour, a display
-            colour that linear scenes convert. What is empty
-            can then not be told from what has this colour: fits are slower and end lower.
+            puts every photograph in front of it and drops the alpha, and the fit composites over the same colour, given as
+            displays show it. What is empty can then not be told from what has this colour: fits are slower and end lower.
         scales: divisors of the photographs' size; every training view is shown once at each (multiscale training of mip-NeRF).
             Rendered scenes are rendered at each size, photographs averaged (`invgraphics.scenes.scales`).
         test_scales: divisors at which the test views are scored besides their own size; the scores are ``psnr_at_1_2`` and so

@@ -94,12 +94,16 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         fits = {planned.id: planned for planned in plan}
         states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
         trials, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
+        replaced = 0
         for name, planned in fits.items():
-            if states[name].status == "missing" and _is_finished(planned, truths[_truth_key(planned)], threads):
-                states[name] = CellState("done")
+            if states[name].status == "missing" and planned.job.folder.finished:
+                if not _is_same(planned, truths[_truth_key(planned)], threads):
+                    replaced += 1
+                elif renderings_complete(planned.job):
+                    states[name] = CellState("done")
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
         _check_threads(missing, threads)
-        warn_of_replaced(sum(_is_replaced(planned, truths[_truth_key(planned)], threads) for planned in missing))
+        warn_of_replaced(replaced)
         costs = _try_methods(missing, trials, threads)
         missing.sort(key=lambda planned: _execution_order(planned, study, costs))
         expected = {planned.id: costs[_cost_key(planned)].seconds(planned.job.budget) for planned in missing}
@@ -173,16 +177,9 @@ def _open_scenes(plan: Sequence[Planned]) -> tuple[Trials, dict[tuple[str, Size]
     return trials, truths
 
 
-def _is_finished(planned: Planned, truth: str, threads: int) -> bool:
-    run = planned.job.folder
-    same = run.finished and run.identity == run_digest(planned.job, truth, threads)
-    return same and renderings_complete(planned.job)
-
-
-def _is_replaced(planned: Planned, truth: str, threads: int) -> bool:
-    """Whether a finished run of other code or pictures is in a cell's place."""
-    run = planned.job.folder
-    return run.finished and run.identity != run_digest(planned.job, truth, threads)
+def _is_same(planned: Planned, truth: str, threads: int) -> bool:
+    """Whether the finished run in a cell's place is of this code and these pictures."""
+    return planned.job.folder.identity == run_digest(planned.job, truth, threads)
 
 
 def _check_threads(missing: Sequence[Planned], threads: int) -> None:

@@ -91,4 +91,6 @@ def _similarity(rows: object, what: str) -> Pose:
     scale = square.diagonal().mean()
     if not float(scale) > 0 or float((square / scale - torch.eye(3)).abs().max()) > 1e-3:
         raise InputError(f"{what} is no similarity: its axes are not orthogonal, or not of one length.")
+    if float(torch.linalg.det(whole[:3, :3])) < 0:
+        raise InputError(f"{what} mirrors the world, which turns no Gaussian into another.")
     return whole

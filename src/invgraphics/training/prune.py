@@ -18,6 +18,7 @@ from invgraphics.errors import InputError
 from invgraphics.training.hooks import FitState
 from invgraphics.training.milestones import MilestoneHook, check_milestones
 from invgraphics.training.penalties import LATTICES
+from invgraphics.training.views.pixels import RandomPixels
 
 RAYS_AT_ONCE = 1024
 """Rays that are traced at once: in fog each has hundreds of samples."""
@@ -114,10 +115,8 @@ def _random_places(view: View, count: int, generator: torch.Generator | None) ->
     place = torch.rand(count, 2, generator=generator) * torch.tensor([view.camera.width, view.camera.height])
     if view.mask is None:
         return place
-    valid = view.mask.reshape(-1).nonzero()[:, 0]
-    flat = valid[torch.randint(len(valid), (count,), generator=generator).to(valid.device)].cpu()
-    corner = torch.stack([flat % view.camera.width, flat // view.camera.width], dim=1)
-    return corner + place.frac()
+    flat = RandomPixels(generator or torch.default_generator).draw(0, view, count)
+    return view.camera.pixel_centres_of(flat) - 0.5 + place.frac()
 
 
 @torch.no_grad()
