@@ -92,5 +92,6 @@ def test_a_refresh_looks_only_where_rays_can_go(make_scene: Callable[..., Scene]
             sampler.update(Noted(40.0, 0.6), Context(scene.bounds, training=True))
         cell = (scene.bounds.to_unit(torch.cat(places)) * 16).long().clamp(0, 15)
         assert sampler.visible is not None and float(sampler.visible.float().mean()) < 0.7
+        assert bool((cells_in_ball(16) | ~sampler.visible).all())
         near_visible = torch.nn.functional.max_pool3d(sampler.visible[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
         assert bool(near_visible[cell.unbind(dim=1)].all())  # points beyond the rim are pulled onto it
