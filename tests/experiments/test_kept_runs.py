@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from made_up_runs import provenance_table
+from PIL import Image
 from training_fixtures import SMALL, InProcess
 
 from invgraphics.errors import InputError
@@ -17,9 +21,10 @@ from invgraphics.experiments.executors.base import Outcome
 from invgraphics.experiments.identity import check_replaceable, run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.renderings import is_kept
-from invgraphics.experiments.request import CompareRequest, FitRequest
+from invgraphics.experiments.request import AblateRequest, CompareRequest, FitRequest
 from invgraphics.recipes.recipe import load_method
 from invgraphics.scenes.open import SceneOptions, open_scene
+from invgraphics.studies.ablate import ablate
 from invgraphics.training.budget import Budget
 
 METHOD = "splatting/gaussians"
@@ -100,14 +105,49 @@ def test_a_comparison_that_is_interrupted_lists_no_run_of_earlier_code(
 def test_a_kept_fit_is_shown_by_another_renderer_without_a_new_fit(
     toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: type[InProcess]
 ) -> None:
-    """The code has changed, and the second command asks for pictures that the first did not."""
+    """The code has changed, and the second command asks for pictures that the first did not; the third finds all there."""
     shared = {"scene": str(toy_folder), "out": str(tmp_path), "methods": (METHOD,), "budget": "2steps"}
     first = CompareRequest(**shared, overrides=tuple(SMALL[METHOD]))
     compare(first)
     (run,) = [Path(fit.out) for fit in first.fits()]
     before = (run / "checkpoint.safetensors").read_bytes()
     monkeypatch.setattr("invgraphics.experiments.identity.code_version", lambda: "9.9+later")
+    compare(CompareRequest(**shared, overrides=tuple(SMALL[METHOD]), render_with=("gaussian-volume/exact:steps=8",), keep=True))
+    assert (run / "checkpoint.safetensors").read_bytes() == before
+    assert len(json.loads((run / "renderings.json").read_text())["renderings"]) == 2
     in_process.made.clear()
     compare(CompareRequest(**shared, overrides=tuple(SMALL[METHOD]), render_with=("gaussian-volume/exact:steps=8",), keep=True))
-    assert not in_process.made and (run / "checkpoint.safetensors").read_bytes() == before
+    assert not in_process.made
+
+
+@pytest.mark.usefixtures("in_process")
+def test_a_study_shows_kept_fits_by_another_renderer_without_a_new_fit(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The code has changed; without ``keep`` the fit would be made again."""
+    study = f'question = "?"\nscenes = ["{toy_folder}"]\nmethods = ["{METHOD}"]\nseeds = [0]\nbudget = "2steps"\n'
+    base = "[base]\n" + "".join(f'"{METHOD}:{key}" = {value}\n' for key, value in (item.split("=") for item in SMALL[METHOD]))
+    (tmp_path / "one.toml").write_text(study + base)
+    request = AblateRequest(study=str(tmp_path / "one.toml"), out=str(tmp_path / "out"))
+    ablate(request, lambda forecast: None)
+    (run,) = (tmp_path / "out" / "runs").iterdir()
+    before = (run / "checkpoint.safetensors").read_bytes(), (run / "fit.json").read_bytes()
+    monkeypatch.setattr("invgraphics.experiments.identity.code_version", lambda: "9.9+later")
+    (tmp_path / "one.toml").write_text('render_with = ["gaussian-volume/exact:steps=8"]\n' + study + base)
+    forecasts = []
+    ablate(replace(request, keep=True), forecasts.append)
+    assert [forecast.missing for forecast in forecasts] == [1]
+    assert ((run / "checkpoint.safetensors").read_bytes(), (run / "fit.json").read_bytes()) == before
     assert len(json.loads((run / "renderings.json").read_text())["renderings"]) == 2
+
+
+@pytest.mark.usefixtures("in_process")
+def test_kept_fits_are_not_shown_beside_other_pictures(toy_folder: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(toy_folder, data)
+    shared = {"scene": str(data), "out": str(tmp_path / "out"), "methods": (METHOD,), "budget": "2steps"}
+    compare(CompareRequest(**shared, overrides=tuple(SMALL[METHOD])))
+    for picture in sorted((data / "test").glob("*.png")):
+        Image.fromarray(255 - np.asarray(Image.open(picture))).save(picture)
+    with pytest.raises(InputError, match="The test views of .* are not those that"):
+        compare(CompareRequest(**shared, overrides=tuple(SMALL[METHOD]), protocol="float", keep=True))

@@ -192,10 +192,10 @@ def test_a_mask_that_leaves_no_smaller_pixel_leaves_out_the_view(scene: Scene, d
     masked = scene.with_views(train=(replace(scene.train[0], mask=stripes), *scene.train[1:3]))
     damaged = degrade(masked, data, 0)
     whole = len(masked.train) * (len(data.scales) - 1)
-    assert len(damaged.train) == whole + 2 and damaged.notes["blank_views"].startswith("1 smaller ones without a valid pixel")
+    assert len(damaged.train) == whole + 2 and damaged.notes["masked_views"].startswith("1 without a valid pixel")
     Batches(BatchConfig(rays=64), damaged, torch.Generator(), torch.device("cpu")).rays(0.0)
     if data.size is not None:
-        with pytest.raises(InputError, match="leave no pixel of any training view at this size"):
+        with pytest.raises(InputError, match="leave no pixel of any training view"):
             degrade(scene.with_views(train=masked.train[:1]), data, 0)
 
 

@@ -121,6 +121,7 @@ def test_finished_fits_of_other_threads_are_not_replaced_unasked(executor, reque
     ablate(request, _yes)
     executor.made.clear()
     monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: None)  # else seven would be what is restored
     with pytest.raises(InputError, match=r"its number of threads is \d+, not 7\.\nGive the same --jobs, add --keep"):
         ablate(request, _yes)
     ablate(replace(request, keep=True), _yes)

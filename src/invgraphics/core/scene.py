@@ -71,6 +71,11 @@ class View:
             return torch.ones(shape, device=self.image.device)
         return _floats(self.alpha.reshape(-1)[index] if index is not None else self.alpha)
 
+    def valid(self) -> Bool[Tensor, "h w"]:
+        """Which pixels count: the mask, or True everywhere."""
+        everywhere = torch.ones(self.image.shape[:2], dtype=torch.bool, device=self.image.device)
+        return everywhere if self.mask is None else self.mask
+
     def over(self, background: Float[Tensor, 3], index: Tensor | None = None) -> Float[Tensor, "*p 3"]:
         """The photograph in front of ``background``."""
         if self.alpha is None:

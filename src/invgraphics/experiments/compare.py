@@ -72,7 +72,7 @@ def _compare(request: CompareRequest) -> tuple[Path, int]:
     summary = replace(_summary(request, jobs, *scenes), refused=tuple(refused), method_choice=choice)
     interrupted: KeyboardInterrupt | None = None
     try:
-        with closing(LocalExecutor().run(missing_fits(request, jobs, scenes[0]), folder.root / "jobs")) as outcomes:
+        with closing(LocalExecutor().run(missing_fits(request, jobs), folder.root / "jobs")) as outcomes:
             for outcome in outcomes:
                 if outcome.status == INTERRUPTED:
                     raise KeyboardInterrupt

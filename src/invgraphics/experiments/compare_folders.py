@@ -9,11 +9,10 @@ import torch
 
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
-from invgraphics.experiments.evaluate import evaluate_run
 from invgraphics.experiments.identity import run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import warn
-from invgraphics.experiments.renderings import is_kept_fit, render_missing, renderings_complete
+from invgraphics.experiments.renderings import is_kept, is_kept_fit, renderings_complete
 from invgraphics.experiments.request import CompareRequest, FitRequest
 from invgraphics.runs.folder import RUNS, RunFolder
 from invgraphics.runs.provenance import Provenance
@@ -43,23 +42,10 @@ def check_folders(request: CompareRequest) -> None:
             )
 
 
-def missing_fits(request: CompareRequest, jobs: Sequence[Job], scene: Scene) -> list[FitRequest]:
-    """Fits to start: all, since each knows by itself whether it is finished, but those that are kept whatever the code.
-
-    Kept ones that the request's protocol has not scored, or its renderers have not shown, are so here, from their checkpoints.
-    """
+def missing_fits(request: CompareRequest, jobs: Sequence[Job]) -> list[FitRequest]:
+    """Fits to start: all, since each finds by itself what is finished, but those that are kept and complete."""
     methods = {job.request.method: job.method for job in jobs}
-    missing = []
-    for fit in request.fits():
-        job = Job.of(fit, methods[fit.method])
-        if not (request.keep and is_kept_fit(job)):
-            missing.append(fit)
-            continue
-        for protocol in job.unscored():
-            evaluate_run(job.folder.root, protocol=protocol)
-        with job.folder.held():
-            render_missing(job, scene)
-    return missing
+    return [fit for fit in request.fits() if not (request.keep and is_kept(Job.of(fit, methods[fit.method])))]
 
 
 def any_finished(request: CompareRequest) -> bool:

@@ -78,9 +78,7 @@ class Monitor:
 
 def _some_pixels(view: View, most: int, generator: torch.Generator) -> Tensor:
     """Flat indices of random valid pixels, all where there are no more than ``most``."""
-    valid = torch.arange(view.camera.width * view.camera.height)
-    if view.mask is not None and bool(view.mask.any()):
-        valid = valid[view.mask.reshape(-1)]
+    valid = view.valid().reshape(-1).nonzero()[:, 0]
     return valid if len(valid) <= most else valid[torch.randint(len(valid), (most,), generator=generator)]
 
 

@@ -66,15 +66,15 @@ def renderings_complete(job: Job) -> bool:
 
 
 def is_kept(job: Job) -> bool:
-    """Whether a finished run is kept although the code has changed since: by the same recipe, with every requested rendering.
+    """Whether a finished run is kept although the code has changed since: by the same recipe, scored and shown as requested.
 
     Its folder, or `check_replaceable`, ensures that scene and request are the same.
     """
-    return is_kept_fit(job) and renderings_complete(job)
+    return is_kept_fit(job) and not job.unscored() and renderings_complete(job)
 
 
 def is_kept_fit(job: Job) -> bool:
-    """The same, whatever renderings there are: they can be made from its checkpoint."""
+    """The same, whatever scores and renderings there are: they can be made from its checkpoint."""
     return job.folder.finished and job.folder.read(Provenance).recipe_sha256 in job.recipe_digests
 
 

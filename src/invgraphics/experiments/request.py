@@ -136,7 +136,8 @@ class FitRequest(Settings):
         seed: of initial values and of the fit.
         existing: what to do with a run that is already there: ``refuse``; ``resume`` it, if it is the same; or ``reuse`` what
             is the same and replace what is not.
-        keep: whether a run is resumed although code, threads or kernels have changed since; its record names the earlier code.
+        keep: whether an unfinished run is resumed, or a finished one reused, although code, threads or kernels have changed
+            since; the record of a resumed one names the earlier code.
         truth: folder for truth images, shared by runs; ``None`` for ``OUT/truth``.
         snapshots: how many states of the model are kept between start and end, for time-lapses.
     """
@@ -197,7 +198,7 @@ class CompareRequest(Settings):
     def fits(self) -> list[FitRequest]:
         """List the fit requests, one per method and seed."""
         shared: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(Settings)}
-        shared |= {"existing": "reuse", "truth": str(Path(self.out) / "truth")}
+        shared |= {"existing": "reuse", "keep": self.keep, "truth": str(Path(self.out) / "truth")}
         return [
             FitRequest(**shared | {"method": method, "seed": seed, "out": str(self.folder(method, seed))})
             for method in self.methods

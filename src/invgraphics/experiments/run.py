@@ -15,21 +15,23 @@ import torch
 from invgraphics import kernels, plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError, NumericalError
-from invgraphics.experiments.build import (
-    build_plan,
-    configure_torch,
-    open_with_progress,
-    use_kernels,
-)
+from invgraphics.experiments.build import build_plan, configure_torch, open_with_progress, use_kernels
 from invgraphics.experiments.clocks import disturbance, fit_costs, fit_record, load_average
 from invgraphics.experiments.environment import begun_by, code_version, continued, environment
 from invgraphics.experiments.evaluate import evaluate, evaluate_saved, expected_seconds, save_truth
-from invgraphics.experiments.identity import check_existing, check_resumable, earlier_code, run_digest, truth_digest
+from invgraphics.experiments.identity import (
+    check_existing,
+    check_resumable,
+    check_truth,
+    earlier_code,
+    run_digest,
+    truth_digest,
+)
 from invgraphics.experiments.job import Job, make_training_scene, region_of
 from invgraphics.experiments.posed import exposure_note, protocol_note, sparse_depth_note
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.recorder import Monitor, Recorder, cut_snapshots
-from invgraphics.experiments.renderings import check_variants, render_missing
+from invgraphics.experiments.renderings import check_variants, is_kept_fit, render_missing
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.start import MemoryForecast, check_losses, initialise_field, memory_forecast, remove_empty, resume
 from invgraphics.files import file_fault
@@ -100,6 +102,9 @@ def _make_run(job: Job, scene: Scene | None, on_step: Callable[[Fit], None] | No
         if request.existing == "resume" and folder.identity and not same:
             check_resumable(job, scene, training_scene)
             other_code, same = earlier_code(job), True
+        if request.existing == "reuse" and request.keep and not same and is_kept_fit(job):
+            check_truth(folder, scene, request.scene)
+            same = True
         if same and folder.finished:
             for protocol in job.unscored():
                 evaluate_saved(folder, scene, protocol)

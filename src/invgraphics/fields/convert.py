@@ -75,11 +75,8 @@ def _random_rays(scene: Scene, most: int) -> Iterator[Rays]:
     for _ in range(-(-most // RAYS)):
         view = scene.train[int(torch.randint(len(scene.train), ()))]
         camera = view.camera
-        if view.mask is None:
-            flat = torch.randint(camera.width * camera.height, (RAYS,))
-        else:
-            valid = view.mask.reshape(-1).nonzero()[:, 0]
-            flat = valid[torch.randint(len(valid), (RAYS,))]
+        valid = view.valid().reshape(-1).nonzero()[:, 0]
+        flat = valid[torch.randint(len(valid), (RAYS,))]
         yield camera.rays(camera.pixel_centres_of(flat))
 
 

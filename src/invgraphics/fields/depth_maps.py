@@ -163,5 +163,4 @@ def _stacked(pictures: Sequence[Tensor]) -> Tensor:
 
 def _finite(view: View, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """A view's depth, 0 where nothing is hit or the pixel does not count."""
-    absent = depth.isinf() if view.mask is None else depth.isinf() | ~view.mask
-    return torch.where(absent, 0.0, depth)
+    return torch.where(depth.isinf() | ~view.valid(), 0.0, depth)

@@ -38,8 +38,7 @@ def plane_sweep(
     total = torch.zeros(len(depths), 6, size[1], size[0])
     seen, colour = torch.zeros(len(depths), size[1], size[0]), torch.zeros(len(depths), 3, size[1], size[0])
     for view in chosen:
-        mask = torch.ones(view.image.shape[:2]) if view.mask is None else view.mask.float()
-        layers = torch.cat([premultiplied(view), mask[None]])
+        layers = torch.cat([premultiplied(view), view.valid()[None].float()])
         maps = homographies_to(camera, depths, view.camera)
         for plane, to_view in enumerate(maps):
             values, inside, _ = warp(layers[None], to_view[None], size)

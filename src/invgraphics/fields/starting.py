@@ -97,8 +97,7 @@ def backdrop_points(scene: Scene, count: int) -> Points:
     shares = [count // len(views) + (index < count % len(views)) for index in range(len(views))]
     positions, colours = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     for view, share in zip(views, shares, strict=True):
-        counts = torch.ones(view.camera.height, view.camera.width) if view.mask is None else view.mask
-        flat = counts.reshape(-1).nonzero()[:, 0]
+        flat = view.valid().reshape(-1).nonzero()[:, 0]
         flat = flat[torch.randperm(len(flat))[:share]]
         rays = view.camera.rays(view.camera.pixel_centres_of(flat))
         subject = max(float((view.camera.position - scene.bounds.centre).norm()), scene.bounds.radius)
@@ -132,10 +131,7 @@ def _seen_points(view: View, most: int) -> Points:
     """Unproject a view's depth map to points; pixels without a hit and masked-out ones are skipped."""
     assert view.depth is not None
     depth = view.depth.reshape(-1)
-    hit = _hits(depth)
-    if view.mask is not None:
-        hit &= view.mask.reshape(-1)
-    flat = hit.nonzero()[:, 0]
+    flat = (_hits(depth) & view.valid().reshape(-1)).nonzero()[:, 0]
     flat = flat[torch.randperm(len(flat))[:most]]
     rays = view.camera.rays(view.camera.pixel_centres_of(flat))
     return Points(rays.origins + depth[flat, None] * rays.directions, view.colour(flat))

@@ -93,7 +93,7 @@ def photograph_colours(mesh: Mesh, views: Sequence[View], near: float) -> Float[
     sums = torch.zeros(len(mesh.vertices), 4)
     for view in views:
         fragments = kernels.mesh_rasterise(mesh.vertices, mesh.faces, view.camera, constant_interval(view.camera, near))
-        weight = view.opacity() if view.mask is None else view.opacity() * view.mask
+        weight = view.opacity() * view.valid()
         light = torch.cat([view.colour() * weight[..., None], weight[..., None]], dim=2)
         # The transpose of interpolation is its gradient.
         with torch.enable_grad():

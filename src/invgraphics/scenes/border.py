@@ -71,7 +71,7 @@ def _masked(view: View) -> View:
     seen = view.opacity() >= 0.5
     if bool(seen.all()):
         return replace(view, alpha=None)
-    return replace(view, alpha=None, mask=seen if view.mask is None else view.mask & seen)
+    return replace(view, alpha=None, mask=seen & view.valid())
 
 
 def background_of(views: Sequence[View]) -> Float[Tensor, 3]:

@@ -24,6 +24,7 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.pictures.resize import wanted_size
 from invgraphics.scenes.scales import check_scales, like, resized_view, scene_at
 from invgraphics.scenes.silhouettes import points_inside
+from invgraphics.scenes.validation import without_blank_views
 
 COLOURS = {"black": (0.0, 0.0, 0.0), "grey": (0.5, 0.5, 0.5), "white": (1.0, 1.0, 1.0)}
 """Backgrounds that have a name."""
@@ -150,9 +151,10 @@ def degrade(scene: Scene, data: TrainingData, seed: int) -> Scene:
         for index in chosen
         if index in views
     ]
-    train, blank = _without_blank(train, scene)
+    scene = without_blank_views(replace(scene, train=tuple(train)))
+    train: Sequence[View] = scene.train
     done = [f"{name} = {value}" for name, value in changes.items() if name not in ("test_scales", "box")]
-    notes = scene.notes | ({"training_data": ", ".join(done)} if done else {}) | blank
+    notes = scene.notes | ({"training_data": ", ".join(done)} if done else {})
     if data.changes_photographs and notes.pop("exposures", None):
         scene = replace(scene, exposure_spread=None)  # estimated from all photographs as they were
     if data.changes_photographs or data.pose_noise or data.init != "scene":
@@ -220,19 +222,6 @@ def _at_scale(scene: Scene, scale: int) -> dict[int, View]:
         return dict(enumerate(views))
     by_name = {view.name: view for view in views}
     return {index: by_name[view.name] for index, view in enumerate(scene.train) if view.name in by_name}
-
-
-def _without_blank(views: Sequence[View], scene: Scene) -> tuple[list[View], dict[str, str]]:
-    """Leave out views of which masks leave no pixel once they are smaller; returns the others, and a note.
-
-    Raises:
-        InputError: none is left.
-    """
-    kept = [view for view in views if view.mask is None or bool(view.mask.any())]
-    if not kept:
-        raise InputError(f"The masks of '{scene.name}' leave no pixel of any training view at this size.", "Use larger ones.")
-    lost = len(views) - len(kept)
-    return kept, {"blank_views": f"{lost} smaller ones without a valid pixel are left out"} if lost else {}
 
 
 def _named(view: View, scale: int) -> View:

@@ -61,9 +61,7 @@ def inside_silhouettes(points: Float[Tensor, "n 3"], views: Sequence[View]) -> B
         seen, pixel = view.camera.pixel_of(points[index])
         pixel = pixel[seen]
         nearby = max_pool2d(view.opacity()[None, None], 3, stride=1, padding=1).reshape(-1)
-        empty = nearby[pixel] <= LEAST_ALPHA
-        if view.mask is not None:
-            empty &= view.mask.reshape(-1)[pixel]
+        empty = (nearby[pixel] <= LEAST_ALPHA) & view.valid().reshape(-1)[pixel]
         inside[index[seen][empty]] = False
     return inside
 
@@ -120,7 +118,7 @@ def _outside(centres: Float[Tensor, "n 3"], radius: float, view: View) -> Bool[T
     pixels = radius * float(camera.focal.max()) / z.clamp_min(radius) + 1
     seen &= z > radius
     level = pixels.log2().ceil().long()
-    solid = view.opacity() if view.mask is None else torch.where(view.mask, view.opacity(), 1.0)
+    solid = torch.where(view.valid(), view.opacity(), 1.0)
     outside, picture = torch.zeros(len(centres), dtype=torch.bool), solid[None, None]
     for size in range(int(level[seen].max()) + 1 if bool(seen.any()) else 0):
         here = (seen & (level == size)).nonzero()[:, 0]

@@ -44,7 +44,7 @@ def validate(scene: Scene) -> Scene:
             poses(torch.stack([view.camera.cam_to_world for view in views]), names.__getitem__)
         for view, name in zip(views, names, strict=True):
             _validate_view(view, name, scene.colour)
-    scene = _without_blank_views(scene)
+    scene = without_blank_views(scene)
     check_scene(scene)
     if off := [view.name for view in scene.train if principal_point_far_outside(view.camera)]:
         message = f"'{off[0]}' has its principal point far outside the picture: a crop, or resized without its calibration?"
@@ -54,7 +54,7 @@ def validate(scene: Scene) -> Scene:
     return _with_val_apart(scene)
 
 
-def _without_blank_views(scene: Scene) -> Scene:
+def without_blank_views(scene: Scene) -> Scene:
     """Leave out views to fit, monitor and score of which masks leave no pixel, as they may once a picture is small.
 
     Raises:
@@ -63,7 +63,7 @@ def _without_blank_views(scene: Scene) -> Scene:
     kept, blank = {}, []
     for split, what in (("train", "training"), ("val", ""), ("test", "test")):
         views = getattr(scene, split)
-        valid = [view.mask is None or bool(view.mask.any()) for view in views]
+        valid = [bool(view.valid().any()) for view in views]
         kept[split] = tuple(itertools.compress(views, valid))
         blank += [view.name for view, one in zip(views, valid, strict=True) if not one]
         if what and not kept[split]:

@@ -21,7 +21,7 @@ from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.identity import check_replaceable, run_digest, truth_digest
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import Reporter
-from invgraphics.experiments.renderings import check_variants, is_kept, renderings_complete
+from invgraphics.experiments.renderings import check_variants, is_kept, is_kept_fit, renderings_complete
 from invgraphics.experiments.request import AblateRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.recipes.presets import announcements
@@ -94,22 +94,22 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
         fits = {planned.id: planned for planned in plan}
         states = {name: _state(planned, request.keep, name in chosen) for name, planned in fits.items()}
         trials, truths = _open_scenes([planned for name, planned in fits.items() if states[name].status == "missing"])
-        replaced = 0
-        for name, planned in fits.items():
-            if states[name].status == "missing" and planned.job.folder.finished:
-                if not _is_same(planned, truths[_truth_key(planned)], threads):
-                    replaced += 1
-                elif renderings_complete(planned.job):
-                    states[name] = CellState("done")
         missing = [planned for name, planned in fits.items() if states[name].status == "missing"]
-        _check_threads(missing, threads)
-        warn_of_replaced(replaced)
+        same = {p.id for p in missing if p.job.folder.finished and _is_same(p, truths[_truth_key(p)], threads)}
+        states |= {p.id: CellState("done") for p in missing if p.id in same and renderings_complete(p.job)}
+        missing = [planned for planned in missing if states[planned.id].status == "missing"]
+        # Fits to which only scores or pictures of another renderer are missing.
+        fitted = {p.id for p in missing if p.id in same or (request.keep and is_kept_fit(p.job))}
+        replaced = [planned for planned in missing if planned.job.folder.finished and planned.id not in fitted]
+        _check_threads(replaced, threads)
+        warn_of_replaced(len(replaced))
         costs = _try_methods(missing, trials, threads)
         missing.sort(key=lambda planned: _execution_order(planned, study, costs))
-        expected = {planned.id: costs[_cost_key(planned)].seconds(planned.job.budget) for planned in missing}
+        budgets = {planned.id: None if planned.id in fitted else planned.job.budget for planned in missing}
+        expected = {planned.id: costs[_cost_key(planned)].seconds(budgets[planned.id]) for planned in missing}
         left = [fits[name] for name, state in states.items() if state.status in ("later", "skipped")]
         later = sum(not planned.job.folder.finished for planned in left)
-        forecast = total([(costs[_cost_key(p)], p.job.budget) for p in missing], len(fits), request.jobs, later)
+        forecast = total([(costs[_cost_key(p)], budgets[p.id]) for p in missing], len(fits), request.jobs, later)
         _check_disk(forecast, folder.root)
         for sentence in announcements(planned.method.choice for planned in plan):
             print(sentence, file=sys.stderr)
@@ -182,19 +182,18 @@ def _is_same(planned: Planned, truth: str, threads: int) -> bool:
     return planned.job.folder.identity == run_digest(planned.job, truth, threads)
 
 
-def _check_threads(missing: Sequence[Planned], threads: int) -> None:
+def _check_threads(replaced: Sequence[Planned], threads: int) -> None:
     """Refuse to replace finished fits by fits with another number of threads.
 
     Raises:
         InputError: names the first.
     """
-    for planned in missing:
-        if planned.job.folder.finished:
-            try:
-                check_replaceable(planned.job, threads)
-            except InputError as error:
-                remedy = "Give the same --jobs, add --keep to keep what is finished, or choose another --out."
-                raise InputError(error.sentence, remedy) from error
+    for planned in replaced:
+        try:
+            check_replaceable(planned.job, threads)
+        except InputError as error:
+            remedy = "Give the same --jobs, add --keep to keep what is finished, or choose another --out."
+            raise InputError(error.sentence, remedy) from error
 
 
 def _try_methods(missing: Sequence[Planned], trials: Trials, threads: int) -> dict[tuple[str, str, Size], Cost]:

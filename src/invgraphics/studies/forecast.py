@@ -49,9 +49,9 @@ class Cost:
     other: float
     size: int
 
-    def seconds(self, budget: Budget) -> float:
-        """Seconds of a run with this budget."""
-        return self.other + self.fit_seconds(budget)
+    def seconds(self, budget: Budget | None) -> float:
+        """Seconds of a run with this budget; ``None`` for one that is fitted, and only scored or shown."""
+        return self.other + (0.0 if budget is None else self.fit_seconds(budget))
 
     def fit_seconds(self, budget: Budget) -> float:
         """Seconds of the fit alone."""
@@ -147,7 +147,7 @@ def _try_steps(fit: Fit) -> float:
     return spent / taken
 
 
-def total(costs: Sequence[tuple[Cost, Budget]], runs: int, jobs: int, later: int = 0) -> Forecast:
+def total(costs: Sequence[tuple[Cost, Budget | None]], runs: int, jobs: int, later: int = 0) -> Forecast:
     """Sum the costs of missing runs, ``jobs`` at a time; a study has ``runs``, ``later`` of them left out."""
     seconds = sum(cost.seconds(budget) for cost, budget in costs) / jobs
     return Forecast(runs, len(costs), seconds, sum(cost.size for cost, _ in costs), later)

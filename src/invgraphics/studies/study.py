@@ -137,6 +137,7 @@ class Study:
             protocol=self.protocol,
             checkpoint_every=request.checkpoint_every,
             existing="reuse",
+            keep=request.keep,
             truth=str(Path(request.out) / "truth"),
             render_with=self.render_with,
         )

@@ -76,9 +76,8 @@ def photometric_error(model: Model, view: View, scene: Scene, scale: float = 1.0
     """Mean squared error between a view's photograph and its camera's rendering, both over the scene's background."""
     small = _at_scale(view, scale)
     picture = model.render(small.camera, normals=False)
-    valid = torch.ones_like(small.opacity(), dtype=torch.bool) if small.mask is None else small.mask
     error = (picture.over(scene.background) - small.over(scene.background)).square()
-    return float(error[valid].mean())
+    return float(error[small.valid()].mean())
 
 
 def _at_scale(view: View, scale: float) -> View:
@@ -102,8 +101,7 @@ class _Photo:
 
     @staticmethod
     def of(view: View, scene: Scene, device: torch.device) -> _Photo:
-        mask = torch.ones(view.image.shape[:2], dtype=torch.bool) if view.mask is None else view.mask
-        flat = mask.reshape(-1).nonzero()[:, 0]
+        flat = view.valid().reshape(-1).nonzero()[:, 0]
         return _Photo(flat, view.over(scene.background, flat).to(device), scene.background.to(device))
 
 

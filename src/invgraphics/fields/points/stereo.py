@@ -90,7 +90,7 @@ def stereo_points(scene: Scene, most: int) -> Points:
 def _shrunk(view: View, bounds: Bounds) -> _Picture:
     camera, alpha = view.camera, view.opacity()
     layers = premultiplied(view)
-    counts = torch.ones_like(alpha) if view.mask is None else view.mask.to(alpha)
+    counts = view.valid().to(alpha)
     shrink = math.sqrt(MOST_PIXELS / alpha.numel())
     if shrink < 1:
         size = max(1, round(camera.height * shrink)), max(1, round(camera.width * shrink))

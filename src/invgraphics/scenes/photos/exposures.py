@@ -82,7 +82,7 @@ def _pixels(view: View, points: Float[Tensor, "k 3"], rows: Int[Tensor, " k"]) -
     height, width = view.image.shape[:2]
     shrink = min(1.0, EDGE / max(height, width))
     size = (max(1, round(height * shrink)), max(1, round(width * shrink)))
-    valid = view.opacity() if view.mask is None else view.opacity() * view.mask
+    valid = view.opacity() * view.valid()
     channels = view.colour().permute(2, 0, 1)
     picture, whole = (torch.nn.functional.adaptive_avg_pool2d(values, size) for values in (channels, valid[None]))
     inside, pixel = view.camera.resized(size[1], size[0]).pixel_of(points.to(view.camera.cam_to_world))

@@ -210,8 +210,7 @@ def _write_masks(views: Sequence[View], names: Sequence[str], folder: Path) -> N
     """Write a mask for each photograph, as COLMAP names them: white where features may be found."""
     folder.mkdir()
     for view, name in zip(views, names, strict=True):
-        valid = torch.ones(view.image.shape[:2], dtype=torch.bool) if view.mask is None else view.mask.cpu()
-        Image.fromarray(valid.numpy().astype(np.uint8) * 255).save(folder / f"{name}.png")
+        Image.fromarray(view.valid().cpu().numpy().astype(np.uint8) * 255).save(folder / f"{name}.png")
 
 
 def _match(folder: Path, seed: int) -> None:

@@ -118,8 +118,7 @@ def _through_landmarks(scene: Scene) -> tuple[Rays, Float[Tensor, " n"]]:
         camera = view.camera
         points = camera.position.new_zeros(0, 3) if view.landmarks is None else view.landmarks.to(camera.position)
         seen, pixel = camera.pixel_of(points)
-        if view.mask is not None:
-            seen &= view.mask.reshape(-1)[pixel].bool()
+        seen &= view.valid().reshape(-1)[pixel]
         found.append(camera.rays(camera.project(points[seen])[0], index))
         distances.append((points[seen] - camera.position).norm(dim=1))
     rays, distance = scene.bounds.clip(Rays.cat(found)), torch.cat(distances)
