@@ -21,8 +21,9 @@ from invgraphics.bench import (
     surface_cases,
     workload,
 )
+from invgraphics.bench.case import Case
 from invgraphics.bench.gates import gates
-from invgraphics.bench.results import BOTH, FORWARD, FORWARD_ONLY, SIZE_KEYS, Results
+from invgraphics.bench.results import BOTH, FORWARD, FORWARD_ONLY, SIZE_KEYS, Results, Skipped
 from invgraphics.bench.run import BenchRequest, bench, measure_case
 from invgraphics.bench.timing import TimingBudget
 from invgraphics.fields.encodings.hash import HashConfig
@@ -178,7 +179,8 @@ def test_without_numba_the_reference_is_measured_alone(monkeypatch) -> None:
     monkeypatch.setattr(run, "cpu_implementations", lambda: ("reference",))
     results = bench(BenchRequest(("splats", "iterations", "peers"), quick=True))
     assert {m.implementation for m in results.measurements} == {"reference", "machine"}
-    assert {skipped.what for skipped in results.skipped} == {"numba kernels", "cuda kernels", "iterations", "peers"}
+    slow = "splat_rasterise gaussians=100 width=16 by the reference"
+    assert {skipped.what for skipped in results.skipped} == {"numba kernels", "cuda kernels", slow, "iterations", "peers"}
     assert results.find("splats", "reference", BOTH).share is None
 
 
@@ -242,3 +244,10 @@ def test_quick_runs_measure_what_promises_on_lattices_are_made_for(monkeypatch) 
         monkeypatch.setattr(module, "GATE_POINTS", 256)
     found = [gate for gate in gates(bench(BenchRequest(("lattice",), quick=True))) if "lattice" in gate.name]
     assert len(found) == 4 and all(gate.measured is not None for gate in found)
+
+
+def test_sizes_that_take_the_reference_minutes_are_left_out_where_it_is_alone_too() -> None:
+    case = Case("splats", {}, dict, without_reference="minutes")
+    skipped: list[Skipped] = []
+    assert measure_case(case, BenchRequest(kernels="reference"), skipped) == []
+    assert [one.why for one in skipped] == ["minutes"]

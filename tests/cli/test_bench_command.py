@@ -15,7 +15,7 @@ from invgraphics.cli.bench import Bench
 from invgraphics.errors import InputError
 
 
-def made_up_run(request) -> Results:
+def made_up_results() -> Results:
     """A run with something in every table, in which all promises but the iteration's are kept."""
     limit = {"amount": 1.0, "unit": "look-ups", "limit": "gather 1 KB", "limit_rate": 20.0}
     results = Results(memory=[PeakMemory("splats", "numba", 10, "Gaussian", 10_000)])
@@ -50,6 +50,14 @@ def made_up_run(request) -> Results:
         measured(lattice_cases.SPARSE_STEP, "numba", BOTH, at, 0.1),
     ]
     results.skipped.append(Skipped("a peer", "it is not installed"))
+    return results
+
+
+def made_up_run(request: bench_run.BenchRequest, results: Results) -> Results:
+    made = made_up_results()
+    results.measurements += made.measurements
+    results.memory += made.memory
+    results.skipped += made.skipped
     return results
 
 
@@ -104,3 +112,37 @@ def test_the_page_is_whole_and_works_offline(tmp_path: Path) -> None:
     exponents = {(g["implementation"], g["along"]): g["exponent"] for g in record["growth"]}
     assert exponents["numba", "gaussians"] == pytest.approx(1)
     assert "load at the start" in record["record"]
+
+
+def test_a_part_does_not_replace_the_page_of_a_whole_run() -> None:
+    folders = [Bench()._default_folder(), Bench(quick=True)._default_folder(), Bench(only="ssim, hash")._default_folder()]
+    assert folders == [Path("reports/bench"), Path("reports/bench-quick"), Path("reports/bench-ssim-hash")]
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def measured_anyway(*_: object) -> Results:
+        raise AssertionError
+
+    monkeypatch.setattr(bench_run, "bench", measured_anyway)
+    (tmp_path / "file").write_text("")
+    assert main.run(["bench", "--out", str(tmp_path / "file")]) == main.BAD_INPUT
+    assert "cannot be written: File exists" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_shows_and_writes_what_it_has_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(request: bench_run.BenchRequest, results: Results) -> Results:
+        results.measurements += made_up_results().measurements[:2]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench_run, "bench", interrupted)
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "earlier.svg").write_text("")
+    assert main.run(["bench", "--out", str(tmp_path)]) == main.INTERRUPTED
+    assert "not measured" in capsys.readouterr().out
+    assert len((tmp_path / "results.csv").read_text().splitlines()) == 3
+    assert json.loads((tmp_path / "bench.json").read_text())["record"]["interrupted"] == "yes"
+    assert not (tmp_path / "figures" / "earlier.svg").exists()

@@ -149,5 +149,5 @@ def test_kept_fits_are_not_shown_beside_other_pictures(toy_folder: Path, tmp_pat
     compare(CompareRequest(**shared, overrides=tuple(SMALL[METHOD])))
     for picture in sorted((data / "test").glob("*.png")):
         Image.fromarray(255 - np.asarray(Image.open(picture))).save(picture)
-    with pytest.raises(InputError, match="The test views of .* are not those that"):
+    with pytest.raises(InputError, match=r"The test views of .* are not those that"):
         compare(CompareRequest(**shared, overrides=tuple(SMALL[METHOD]), protocol="float", keep=True))

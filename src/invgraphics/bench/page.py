@@ -15,6 +15,9 @@ from invgraphics.bench.results import Results, write_tables
 from invgraphics.bench.tables import Table, kernels_of
 from invgraphics.files import write_text
 
+FIGURES = "figures"
+"""Folder of the plots."""
+
 
 @dataclass(frozen=True)
 class Section:
@@ -45,6 +48,8 @@ def write(results: Results, record: Mapping[str, object], folder: Path, style: P
         style: style of plots and page.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    for figure in (folder / FIGURES).glob("*.svg"):  # of an earlier run, which measured other parts
+        figure.unlink()
     write_tables(results, folder)
     found, power_laws = gates(results), growths(kernels_of(results))
     whole = {
@@ -74,7 +79,7 @@ def _write_page(results: Results, record: Mapping[str, object], found: list[Gate
         "command": record.get("command", ""),
         "gates": tables.gate_table(found),
         "headline": headline(found),
-        "sections": [section for section in _sections(results, folder / "figures", style) if section.table.rows],
+        "sections": [section for section in _sections(results, folder / FIGURES, style) if section.table.rows],
         "skipped": results.skipped,
         "url": lambda path: path.relative_to(folder).as_posix(),
     }
@@ -113,12 +118,13 @@ def _sections(results: Results, figures: Path, style: PlotStyle) -> list[Section
 
 
 _KERNELS = (
-    "Median time and quartiles of one call. The reference (plain torch), Numba and the limit take turns, call by call, so a "
-    "disturbance meets all of them. Splats count the alphas that the rasteriser evaluates (16 for every visit of a footprint "
-    "to a block of 4 x 4 pixels; the backward pass visits again) against exponentials per second; hash encoding counts 8 "
-    "look-ups per level and point and pass against random reads in a table of one level's size, lattices the cache lines that "
-    "a point reads against random reads among all their features; what streams through memory is compared with the triad, "
-    "SSIM's filters with the matrix product."
+    "Median time and quartiles of one call; the first call of each is discarded, then two to nine count in a quick run, three "
+    "to fifteen in a whole one, fewest of slow ones (results.csv counts them). The reference (plain torch), Numba and the limit "
+    "take turns, call by call, so a disturbance meets all of them. Splats count the alphas that the rasteriser evaluates (16 for "
+    "every visit of a footprint to a block of 4 x 4 pixels; the backward pass visits again) against exponentials per second; "
+    "hash encoding counts 8 look-ups per level and point and pass against random reads in a table of one level's size, lattices "
+    "the cache lines that a point reads against random reads among all their features; what streams through memory is compared "
+    "with the triad, SSIM's filters with the matrix product."
 )
 _STEPS = (
     "A whole step of a fit (draw, render, compare, differentiate, Adam; for the hash grid also its share of an update of the "

@@ -58,10 +58,15 @@ class BenchRequest:
         return (self.kernels,) if self.kernels else cpu_implementations()
 
 
-def bench(request: BenchRequest) -> Results:
-    """Run the requested parts of the benchmark; the kernel selection is restored afterwards."""
+def bench(request: BenchRequest, results: Results | None = None) -> Results:
+    """Run the requested parts of the benchmark; the kernel selection is restored afterwards.
+
+    Args:
+        request: what to measure.
+        results: receives every measurement as it is made, so that an interrupted run keeps what it has, and is returned.
+    """
     keep_freed_memory()
-    results = Results()
+    results = Results() if results is None else results
     if not request.kernels:
         missing = (name for name in IMPLEMENTATIONS if name not in cpu_implementations())
         results.skipped += [
@@ -111,10 +116,12 @@ def measure_case(case: Case, request: BenchRequest, skipped: list[Skipped]) -> l
     """Measure a case in every direction: all implementations and the limit, in alternation."""
     request.progress(str(case))
     names = list(request.implementations)
-    if case.without_reference and "reference" in names and len(names) > 1:
+    if case.without_reference and "reference" in names:
         names.remove("reference")
         skipped.append(Skipped(f"{case} by the reference", case.without_reference))
-    found = []
+    found: list[Measurement] = []
+    if not names:
+        return found
     for direction, work in case.prepare().items():
         variants = {name: _with_kernels(name, work.run) for name in names}
         if work.limit:

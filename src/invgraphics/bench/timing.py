@@ -56,16 +56,13 @@ def clock(work: Callable[[], object]) -> float:
 
 
 def alternate(variants: Mapping[str, Callable[[], object]], budget: TimingBudget) -> dict[str, Timing]:
-    """Time variants in alternation: A B C A B C ... The first round warms caches and is discarded, except for variants whose
-    single call exceeds the budget.
+    """Time variants in alternation: A B C A B C ... The first round compiles and warms caches, and is discarded.
 
     A variant that has had its repetitions drops out.
     """
-    first = {name: clock(work) for name, work in variants.items()}
-    seconds: dict[str, list[float]] = {name: [taken] if taken >= budget.seconds else [] for name, taken in first.items()}
-    for name, work in variants.items():
-        if not seconds[name]:
-            seconds[name].append(clock(work))
+    for work in variants.values():
+        work()
+    seconds = {name: [clock(work)] for name, work in variants.items()}
     wanted = {name: budget.repetitions(taken[0]) for name, taken in seconds.items()}
     for turn in range(1, max(wanted.values(), default=0)):
         for name, work in variants.items():

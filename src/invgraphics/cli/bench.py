@@ -19,6 +19,7 @@ from invgraphics.errors import InputError
 
 if TYPE_CHECKING:
     from invgraphics.bench.plots import PlotStyle
+    from invgraphics.bench.results import Results
     from invgraphics.bench.run import BenchRequest
 
 
@@ -38,25 +39,41 @@ class Bench:
     ] = None
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: all in alternation)")] = None
     """Measure one implementation only: numba, or reference (plain torch)."""
-    out: Annotated[Path, arg(metavar="FOLDER")] = Path("reports/bench")
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/bench[-quick|-PARTS])")] = None
     """Folder of the tables and the page."""
     check: bool = False
     """Exit with status 1 if a promise is missed or was not measured."""
 
     def run(self) -> int:
-        """Measure; prints the gates and the page's path. Returns the exit status."""
+        """Measure; prints the gates and the page's path. Returns the exit status.
+
+        Interrupted, it prints and writes what it has measured.
+        """
         parts = self.parts()
 
+        from invgraphics.bench.results import Results
+        from invgraphics.bench.run import bench
+        from invgraphics.runs.folder import output_folder
+
+        request, out = self.request(parts), self.out or self._default_folder()
+        with output_folder(out):
+            began, record, results = time.perf_counter(), self._record(), Results()
+            try:
+                bench(request, results)
+            except KeyboardInterrupt:
+                record["interrupted"] = "yes"
+                if results.measurements:
+                    self._publish(results, record, began, out)
+                raise
+            return self._publish(results, record, began, out)
+
+    def _publish(self, results: Results, record: dict[str, object], began: float, out: Path) -> int:
+        """Print the tables, then write them and the page; returns the exit status."""
         from invgraphics.bench.gates import gates
         from invgraphics.bench.page import headline, write
-        from invgraphics.bench.run import bench
         from invgraphics.bench.tables import gate_table, kernel_table, step_table
 
-        began, record = time.perf_counter(), self._record()
-        results = bench(self.request(parts))
         record |= {"seconds": round(time.perf_counter() - began), "load at the end": _load()}
-        page = write(results, record, self.out, _plot_style())
-
         for title, table in (("Kernels", kernel_table(results)), ("Whole steps", step_table(results))):
             if table.rows:
                 show_table(title, table.columns, table.rows)
@@ -65,8 +82,13 @@ class Bench:
         found = gates(results)
         promises = gate_table(found)
         show_table(headline(found), promises.columns, promises.rows)
-        print(f"Page: {page}")
+        print(f"Page: {write(results, record, out, _plot_style())}")
         return int(self.check and any(gate.verdict != "PASS" for gate in found))
+
+    def _default_folder(self) -> Path:
+        """Folder by what is measured, so that a part does not replace the page of a whole run."""
+        some = "-".join(parse_list(self.only, "--only")) if self.only else ""
+        return Path("reports") / "-".join(filter(None, ("bench", "quick" if self.quick else "", some)))
 
     def parts(self) -> tuple[str, ...]:
         """Names of the parts to measure, in order.
