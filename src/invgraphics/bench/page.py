@@ -119,12 +119,12 @@ def _sections(results: Results, figures: Path, style: PlotStyle) -> list[Section
 
 _KERNELS = (
     "Median time and quartiles of one call; the first call of each is discarded, then two to nine count in a quick run, three "
-    "to fifteen in a whole one, fewest of slow ones (results.csv counts them). The reference (plain torch), Numba and the limit "
-    "take turns, call by call, so a disturbance meets all of them. Splats count the alphas that the rasteriser evaluates (16 for "
-    "every visit of a footprint to a block of 4 x 4 pixels; the backward pass visits again) against exponentials per second; "
-    "hash encoding counts 8 look-ups per level and point and pass against random reads in a table of one level's size, lattices "
-    "the cache lines that a point reads against random reads among all their features; what streams through memory is compared "
-    "with the triad, SSIM's filters with the matrix product."
+    "to fifteen in a whole one, fewest of slow ones (results.csv counts them). The reference (plain torch), Numba and the "
+    "limit take turns, call by call, so a disturbance meets all of them. Splats count the alphas that the rasteriser evaluates "
+    "(16 for every visit of a footprint to a block of 4 x 4 pixels; the backward pass visits again) against exponentials per "
+    "second; hash encoding counts 8 look-ups per level and point and pass against random reads in a table of one level's size, "
+    "lattices the cache lines that a point reads against random reads among all their features; what streams through memory is "
+    "compared with the triad, SSIM's filters with the matrix product."
 )
 _STEPS = (
     "A whole step of a fit (draw, render, compare, differentiate, Adam; for the hash grid also its share of an update of the "
