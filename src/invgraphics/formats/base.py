@@ -95,14 +95,13 @@ def write_gaussians(path: Path, name: str, splats: Splats, **settings: int) -> N
     """Write a file in the format ``name``, whole or not at all; ``settings`` are those of its class, such as a version.
 
     Raises:
-        InputError: the format is unknown or cannot be written, the file has another format's ending, there are no Gaussians, or
+        InputError: the format is unknown or cannot be written, the file's name has another ending, there are no Gaussians, or
             they do not fit into the format.
     """
     form = plugins.load("formats", name)(**settings)
     if not isinstance(form, WritableFormat):
         raise InputError(f"The format '{name}' can only be read.")
-    known = {suffix for other in plugins.names("formats") for suffix in plugins.load("formats", other).suffixes}
-    if path.suffix.lower() in known and not path.name.lower().endswith(form.suffixes):
+    if not path.name.lower().endswith(form.suffixes):  # a run's checkpoint, say, would be overwritten
         raise InputError(f"'{path}' has another ending than {name} files.", f"Expected: {' or '.join(form.suffixes)}.")
     splats = checked(splats, path)
     with replacing(path) as temporary:
