@@ -27,45 +27,47 @@ class Ablate:
     """Run a study: methods and scenes under every level of its factors, with several seeds; then write its report.
 
     The same command again keeps finished runs and continues the others. Exit status 1: some runs failed.
+
+    Attributes:
+        study: A built-in study (see `invgraphics list studies`), or the path of a study.toml.
+        out: Folder of the report and its runs.
+        executor: What runs the fits: this machine, or a Ray cluster, which must share its files.
+        jobs: Fits that share a machine; each gets an equal part of its cores. One at a time keeps timings fair.
+        gpus: GPUs of each fit; for a cluster only.
+        address: The Ray cluster; with --executor ray only.
+        yes: Start a study of more than four hours without asking.
+        seeds: Each cell is fitted once per seed.
+        budget: How long each fit may optimise.
+        size: Size of the pictures; one number is the longest side.
+        test_views: How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set
+            N evenly spaced ones.
+        spp: Samples per pixel of the training views of scenes that are rendered.
+        device: Device that computes.
+        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+        checkpoint_every: Interval between checkpoints, the most work that an interruption costs.
+        keep: Keep finished cells whose recipe, scene and request are the same although the code has changed since.
+        cells: Run only the cells whose label METHOD SCENE@SIZE BUDGET seed=N fits, for instance 'splatting/* fence@400 *'.
+        most_seconds: Leave fits with a longer budget for later.
     """
 
     study: Annotated[Positional[str], arg(metavar="STUDY")]
-    """A built-in study (see `invgraphics list studies`), or the path of a study.toml."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/STUDY)")] = None
-    """Folder of the report and its runs."""
     executor: Annotated[str, arg(metavar="local|ray")] = "local"
-    """What runs the fits: this machine, or a Ray cluster, which must share its files."""
     jobs: Annotated[int, arg(metavar="N")] = 1
-    """Fits that share a machine; each gets an equal part of its cores. One at a time keeps timings fair."""
     gpus: Annotated[float | None, arg(metavar="N", help_behavior_hint="(default: 1 with --device cuda)")] = None
-    """GPUs of each fit; for a cluster only."""
     address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="(default: one started for this study)")] = None
-    """The Ray cluster; with --executor ray only."""
     yes: bool = False
-    """Start a study of more than four hours without asking."""
     seeds: Annotated[str | None, arg(metavar="0,1,2", help_behavior_hint="(default: the study's)")] = None
-    """Each cell is fitted once per seed."""
     budget: Annotated[str | None, arg(metavar="60s|5000steps", help_behavior_hint="(default: the study's)")] = None
-    """How long each fit may optimise."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the study's)")] = None
-    """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str | None, arg(metavar="N|all", help_behavior_hint="(default: the study's)")] = None
-    """How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set N evenly
-    spaced ones."""
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the study's)")] = None
-    """Samples per pixel of the training views of scenes that are rendered."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
-    """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
-    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     checkpoint_every: Annotated[str, arg(metavar="30s|5m|100steps")] = "30s"
-    """Interval between checkpoints, the most work that an interruption costs."""
     keep: bool = False
-    """Keep finished cells whose recipe, scene and request are the same although the code has changed since."""
     cells: Annotated[str | None, arg(metavar="PATTERN", help_behavior_hint="(default: all)")] = None
-    """Run only the cells whose label METHOD SCENE@SIZE BUDGET seed=N fits, for instance 'splatting/* fence@400 *'."""
     most_seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="(default: no limit)")] = None
-    """Leave fits with a longer budget for later."""
 
     def run(self) -> int:
         """Run the missing cells; prints failures and the page's path. Returns the exit status, 1 if cells failed."""

@@ -31,41 +31,46 @@ _POSITIONAL = get_args(Positional[int])[1]
 
 @dataclass(frozen=True, kw_only=True)
 class Shared:
-    """Options shared by ``fit`` and ``compare``."""
+    """Options shared by ``fit`` and ``compare``.
+
+    Attributes:
+        budget: How long each fit may optimise: seconds (60s, 2m, 1h), or steps (5000steps).
+        preset: Size of the method. The budget chooses: laptop under two minutes (and for steps), long up to 30, hour above, or
+            the nearest smaller one that the method has; paper holds the published values.
+        overrides: Change one value of the recipe, for instance --set batches.rays=2048 (`invgraphics list METHOD` shows all of
+            a method's keys), or of the training data: data.train_views=10, data.size, data.pose_noise (degrees and per cent),
+            data.photo_noise, data.exposure (stops), data.background, data.scales (divisors of the size, [1, 2, 4, 8]),
+            data.test_scales (more scores, of smaller pictures), data.init (points to start from: scene, sfm, random), data.box
+            (scene: not that of the silhouettes).
+        size: Size of the pictures; one number is the longest side.
+        test_views: How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set
+            N evenly spaced ones.
+        spp: Samples per pixel of the training views of a scene that is rendered; the others keep their proportion.
+        max_primitives: Largest number of Gaussians or points, for methods that have some; short for --set max_primitives=N.
+        optimise: Fit the training cameras' poses too, or an exposure of each training photograph, or both; short for --set
+            training.poses.optimise=true and --set training.exposure.optimise=true. Exposures are fitted unasked where those of
+            a COLMAP reconstruction's photographs differ.
+        device: Device that computes.
+        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+        protocol: How pictures are scored: default (rounded to 8 bits), or float.
+        checkpoint_every: Interval between checkpoints, the most work that an interruption costs.
+        render_with: Show the fitted fields through the renderers of other methods, too; METHOD:key=value changes a renderer's
+            setting.
+    """
 
     budget: Annotated[str, arg(metavar="60s|5000steps")] = "60s"
-    """How long each fit may optimise: seconds (60s, 2m, 1h), or steps (5000steps)."""
     preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: from the budget)")] = None
-    """Size of the method. The budget chooses: laptop under two minutes (and for steps), long up to 30, hour above, or the
-    nearest smaller one that the method has; paper holds the published values."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
-    """Change one value of the recipe, for instance --set batches.rays=2048 (`invgraphics list METHOD` shows all of a method's
-    keys), or of the training data: data.train_views=10, data.size, data.pose_noise (degrees and per cent), data.photo_noise,
-    data.exposure (stops), data.background, data.scales (divisors of the size, [1, 2, 4, 8]), data.test_scales (more scores, of
-    smaller pictures), data.init (points to start from: scene, sfm, random), data.box (scene: not that of the silhouettes)."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
-    """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
-    """How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set N evenly
-    spaced ones."""
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
-    """Samples per pixel of the training views of a scene that is rendered; the others keep their proportion."""
     max_primitives: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the recipe's)")] = None
-    """Largest number of Gaussians or points, for methods that have some; short for --set max_primitives=N."""
     optimise: Annotated[str, arg(metavar="poses,exposure")] = ""
-    """Fit the training cameras' poses too, or an exposure of each training photograph, or both; short for
-    --set training.poses.optimise=true and --set training.exposure.optimise=true. Exposures are fitted unasked where those of a
-    COLMAP reconstruction's photographs differ."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
-    """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
-    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     protocol: Annotated[str, arg(metavar="NAME")] = "default"
-    """How pictures are scored: default (rounded to 8 bits), or float."""
     checkpoint_every: Annotated[str, arg(metavar="30s|5m|100steps")] = "30s"
-    """Interval between checkpoints, the most work that an interruption costs."""
     render_with: Annotated[str, arg(metavar="A,B")] = ""
-    """Show the fitted fields through the renderers of other methods, too; METHOD:key=value changes a renderer's setting."""
 
     def settings(self) -> dict[str, Any]:
         """Convert the options to validated keyword arguments of a request.

@@ -29,20 +29,22 @@ class Bench:
 
     Ratios are taken within the run, those to the reference, limits and peers from calls in alternation; close other programs
     for times that mean something.
+
+    Attributes:
+        quick: Only small sizes and those that promises are made for (under two minutes).
+        kernels: Measure one implementation only: numba, or reference (plain torch).
+        out: Folder of the tables and the page.
+        check: Exit with status 1 if a promise is missed or was not measured.
     """
 
     quick: bool = False
-    """Only small sizes and those that promises are made for (under two minutes)."""
     only: Annotated[
         str | None,
         arg(metavar="A,B,C", help=f"Parts to measure: {', '.join(PARTS)}.", help_behavior_hint="(default: everything)"),
     ] = None
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: all in alternation)")] = None
-    """Measure one implementation only: numba, or reference (plain torch)."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/bench[-quick|-PARTS])")] = None
-    """Folder of the tables and the page."""
     check: bool = False
-    """Exit with status 1 if a promise is missed or was not measured."""
 
     def run(self) -> int:
         """Measure; prints the gates and the page's path. Returns the exit status.

@@ -23,19 +23,21 @@ class Compare(Shared):
 
     The same command again keeps finished runs and continues the others. On a rendered scene, methods that start from points
     start from those found in the training photographs, unless --set data.init says otherwise. Exit status 1: some fits failed.
+
+    Attributes:
+        scene: A built-in scene (see `invgraphics list scenes`), or the path of a data set.
+        methods: Methods with commas between them (see `invgraphics list methods`); METHOD:key=value changes a value of the
+            recipe. `all`, or a pattern such as `volumetric/*`, takes those that go with the scene.
+        seeds: Each method is fitted once per seed.
+        keep: Keep finished runs whose recipe, scene and request are the same although the code has changed since.
+        out: Folder of the report and its runs.
     """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
     methods: Annotated[str | None, arg(metavar="A,B,C", help_behavior_hint="(default: those that suit the scene)")] = None
-    """Methods with commas between them (see `invgraphics list methods`); METHOD:key=value changes a value of the recipe.
-    `all`, or a pattern such as `volumetric/*`, takes those that go with the scene."""
     seeds: Annotated[str, arg(metavar="0,1,2")] = "0"
-    """Each method is fitted once per seed."""
     keep: bool = False
-    """Keep finished runs whose recipe, scene and request are the same although the code has changed since."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: reports/compare-SCENE)")] = None
-    """Folder of the report and its runs."""
 
     def run(self) -> int:
         """Run the comparison; prints the table and the page's path. Returns the exit status, 1 if fits failed."""

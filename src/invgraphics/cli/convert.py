@@ -19,31 +19,34 @@ SIZES = ", ".join(f"{count} {what}" for count, what in CONVERSION_SIZES.values()
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Convert a run's model to another kind of scene, score it, refit it briefly, and keep it as a run like any other."""
+    """Convert a run's model to another kind of scene, score it, refit it briefly, and keep it as a run like any other.
+
+    Attributes:
+        folder: The folder of a run.
+        to: What to make: Gaussians or neural points on the surfaces that training views see; a voxel grid of density and
+            spherical harmonics; the mesh of an isosurface; or a multi-plane image, for scenes seen from one side. All but
+            Gaussians and points need a density, or a mesh a distance.
+        out: Folder of the new run.
+        method: Method whose field is made, and which refits it.
+        refit: Budget of the refit.
+        size: Gaussians and points: how many. Lattice: vertices along the longest edge. Mesh: voxels along the longest edge of
+            the grid that the surface is extracted from.
+        overrides: Change one value of the method's recipe.
+        seed: Seed of the sampling and of the refit.
+        scene: Another copy of the scene, for instance where the data set has moved.
+        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+    """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a run."""
     to: Annotated[str, arg(metavar="gaussians|lattice|mesh|mpi|points")]
-    """What to make: Gaussians or neural points on the surfaces that training views see; a voxel grid of density and spherical
-    harmonics; the mesh of an isosurface; or a multi-plane image, for scenes seen from one side. All but Gaussians and points
-    need a density, or a mesh a distance."""
     out: Annotated[Path, arg(metavar="RUN2")]
-    """Folder of the new run."""
     method: Annotated[str, arg(metavar="METHOD", help_behavior_hint="(default: one that suits the target)")] = ""
-    """Method whose field is made, and which refits it."""
     refit: Annotated[str, arg(metavar="10s|500steps")] = "10s"
-    """Budget of the refit."""
     size: Annotated[int | None, arg(metavar="N", help_behavior_hint=f"(default: {SIZES})")] = None
-    """Gaussians and points: how many. Lattice: vertices along the longest edge. Mesh: voxels along the longest edge of the grid
-    that the surface is extracted from."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
-    """Change one value of the method's recipe."""
     seed: int = 0
-    """Seed of the sampling and of the refit."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the scene, for instance where the data set has moved."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
-    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
 
     def run(self) -> int:
         """Convert, refit and score; prints the three scores and the new folder. Returns exit status 0."""

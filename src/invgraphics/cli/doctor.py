@@ -31,10 +31,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check this machine: processor, kernels, LLVM for Mitsuba, CUDA and extras, with a remedy for what is missing."""
+    """Check this machine: processor, kernels, LLVM for Mitsuba, CUDA and extras, with a remedy for what is missing.
+
+    Attributes:
+        warm_up: Compile the kernels now, so that no later command waits for it.
+    """
 
     warm_up: bool = False
-    """Compile the kernels now, so that no later command waits for it."""
 
     def run(self) -> int:
         """Run the checks and print them; returns exit status 0."""

@@ -14,14 +14,17 @@ from invgraphics.runs.folder import check_run
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Render the test views of a finished run again from its model, and score them."""
+    """Render the test views of a finished run again from its model, and score them.
+
+    Attributes:
+        folder: The folder of a run.
+        scene: Another copy of the scene, for instance where the data set has moved.
+        protocol: How pictures are scored: default (rounded to 8 bits), or float.
+    """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a run."""
     scene: Annotated[Positional[str | None], arg(metavar="[SCENE]", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the scene, for instance where the data set has moved."""
     protocol: Annotated[str, arg(metavar="NAME")] = "default"
-    """How pictures are scored: default (rounded to 8 bits), or float."""
 
     def run(self) -> int:
         """Score the run and print the scores; returns exit status 0."""

@@ -26,20 +26,22 @@ class Explain:
     """List what one pixel's ray intersects: alpha, weight, transmittance and colour of every sample or Gaussian.
 
     Writes a figure (ray.png, ray.svg), a table (ray.csv) and the numbers of both (ray.json).
+
+    Attributes:
+        folder: The folder of a run.
+        view: Index of the view, from 0.
+        pixel: The pixel, counted from 0 from the upper left corner.
+        split: Whose views are counted.
+        out: Where to write.
+        scene: Another copy of the scene, for instance where the data set has moved.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a run."""
     view: Annotated[int, arg(metavar="N")]
-    """Index of the view, from 0."""
     pixel: Annotated[str, arg(metavar="COLUMN,ROW")]
-    """The pixel, counted from 0 from the upper left corner."""
     split: Literal["test", "train"] = "test"
-    """Whose views are counted."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: RUN/explained/...)")] = None
-    """Where to write."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the scene, for instance where the data set has moved."""
 
     def run(self) -> int:
         """Write figure and table; prints the table and the figure's path. Returns exit status 0."""

@@ -35,40 +35,42 @@ class Export:
     """Write a run's model, in the coordinates of the data set's world, as a file that other programs read.
 
     Files of Gaussians are read back and rendered from the run's test cameras, to report the loss as PSNR.
+
+    Attributes:
+        folder: The folder of a run.
+        to: What to write: of Gaussians ply (3DGS's own, without loss), splat (32 bytes per Gaussian, no view dependence) or spz
+            (smallest); of any model mesh, a surface with coloured vertices as GLB, PLY or OBJ; of planes and densities mpi, a
+            zip archive of PNG layers and their JSON description.
+        out: The file to write; one that exists is replaced. A mesh has the format of its ending: .glb, .ply or .obj.
+        scene: Another copy of the scene, for instance where the data set has moved.
+        world: Where the world's +x, +y, +z point, for formats that want certain axes (spz, glb: right, up, back): opencv is
+            right, down, forward; opengl right, up, back; z-up right, forward, up. Built-in and Blender scenes are z-up.
+        level: For mesh: the density per local unit (or the signed distance) of the surface; Gaussians have none.
+        resolution: For mesh: voxels along the longest edge of the scene's box.
+        sh_degree: For ply and spz: degree of the spherical harmonics in the file; bands that the run does not have are zeros.
+        planes: For mpi of a density: number of planes that it is sliced into, evenly spaced in inverse depth.
+        view: For mpi of a density: training view whose camera is the reference.
+        spz_version: For spz: version of the format; many viewers read up to 3 only.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a run."""
     to: Annotated[str, arg(metavar="NAME")]
-    """What to write: of Gaussians ply (3DGS's own, without loss), splat (32 bytes per Gaussian, no view dependence) or spz
-    (smallest); of any model mesh, a surface with coloured vertices as GLB, PLY or OBJ; of planes and densities mpi, a zip
-    archive of PNG layers and their JSON description."""
     out: Annotated[Path, arg(metavar="FILE")]
-    """The file to write; one that exists is replaced. A mesh has the format of its ending: .glb, .ply or .obj."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the scene, for instance where the data set has moved."""
     world: Annotated[
         str | None, arg(metavar="opencv|opengl|z-up|RDF", help_behavior_hint="(default: opencv; for glb z-up)")
     ] = None
-    """Where the world's +x, +y, +z point, for formats that want certain axes (spz, glb: right, up, back): opencv is right,
-    down, forward; opengl right, up, back; z-up right, forward, up. Built-in and Blender scenes are z-up."""
     level: Annotated[float | None, arg(metavar="X", help_behavior_hint="(default: alpha 1/2 in 1% of the scene)")] = None
-    """For mesh: the density per local unit (or the signed distance) of the surface; Gaussians have none."""
     resolution: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 192)")] = None
-    """For mesh: voxels along the longest edge of the scene's box."""
 
     sh_degree: Annotated[
         int | None, arg(metavar="0..3", help_behavior_hint="(default: ply 3, as most loaders insist; else the run's own)")
     ] = None
-    """For ply and spz: degree of the spherical harmonics in the file; bands that the run does not have are zeros."""
     planes: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 32)")] = None
-    """For mpi of a density: number of planes that it is sliced into, evenly spaced in inverse depth."""
     view: Annotated[
         str | None, arg(metavar="NAME", help_behavior_hint="(default: the mean of all, where they look one way)")
     ] = None
-    """For mpi of a density: training view whose camera is the reference."""
     spz_version: Annotated[int | None, arg(metavar="3|4", help_behavior_hint="(default: 4)")] = None
-    """For spz: version of the format; many viewers read up to 3 only."""
 
     def run(self) -> int:
         """Write the file and print facts about it; returns exit status 0."""

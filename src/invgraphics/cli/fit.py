@@ -20,22 +20,26 @@ from invgraphics.text import slug
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(Shared):
-    """Fit one method to one scene, then render and score its test views."""
+    """Fit one method to one scene, then render and score its test views.
+
+    Attributes:
+        method: renderer/recipe (see `invgraphics list methods`), or the path of a recipe.
+        scene: A built-in scene (see `invgraphics list scenes`), or the path of a data set.
+        seed: Seed of the initial values and of the fit.
+        out: Folder of the run.
+        snapshots: Keep N states of the model, evenly over the fit, besides the first, for `invgraphics render RUN --path
+            timelapse`.
+        resume: Continue the run in --out from its last checkpoint.
+        keep: With --resume: continue although the code, of invgraphics or of a plug-in, has changed since; the record says so.
+    """
 
     method: Annotated[Positional[str], arg(metavar="METHOD")]
-    """renderer/recipe (see `invgraphics list methods`), or the path of a recipe."""
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """A built-in scene (see `invgraphics list scenes`), or the path of a data set."""
     seed: int = 0
-    """Seed of the initial values and of the fit."""
     out: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="(default: runs/SCENE-METHOD-seed-N)")] = None
-    """Folder of the run."""
     snapshots: Annotated[int, arg(metavar="N")] = 0
-    """Keep N states of the model, evenly over the fit, besides the first, for `invgraphics render RUN --path timelapse`."""
     resume: bool = False
-    """Continue the run in --out from its last checkpoint."""
     keep: bool = False
-    """With --resume: continue although the code, of invgraphics or of a plug-in, has changed since; the record says so."""
 
     def run(self) -> int:
         """Run the fit; prints its scores and its folder. Returns exit status 0."""

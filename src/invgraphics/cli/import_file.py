@@ -16,37 +16,40 @@ from invgraphics.recipes.recipe import presets
 
 @dataclass(frozen=True, kw_only=True)
 class ImportFile:
-    """Make a run of a file of 3D Gaussians that any tool trained, then render and score its test views like any other run's."""
+    """Make a run of a file of 3D Gaussians that any tool trained, then render and score its test views like any other run's.
+
+    Attributes:
+        file: A .ply of 3DGS, a compressed .ply, a .splat or a .spz (see `invgraphics list model-formats`).
+        scene: The scene that it was trained on: built-in, or the path of a data set.
+        out: Folder of the run.
+        method: A method of Gaussians, whose renderer shows the model.
+        overrides: Change one value of the recipe, for instance --set renderer.dilation=0.1.
+        frame: Where the file's +x, +y, +z point: opencv is right, down, forward; opengl right, up, back; z-up right, forward,
+            up; or three letters. Files that do not say (all but spz) are taken to be in the data set's world.
+        world: Where the axes of the data set's world point, for files with certain axes; opencv fits what converters write.
+        transform: Similarity from the data set's world to the file's frame: the dataparser_transforms.json that nerfstudio
+            writes beside its models (`transform`, 3 x 4, and `scale`), which its exported splats have had.
+        size: Size of the pictures; one number is the longest side.
+        test_views: How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set
+            N evenly spaced ones.
+        device: Device that computes.
+        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+        protocol: How pictures are scored: default (rounded to 8 bits), or float.
+    """
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """A .ply of 3DGS, a compressed .ply, a .splat or a .spz (see `invgraphics list model-formats`)."""
     scene: Annotated[str, arg(metavar="SCENE")]
-    """The scene that it was trained on: built-in, or the path of a data set."""
     out: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="(default: runs/SCENE-FILE)")] = None
-    """Folder of the run."""
     method: Annotated[str, arg(metavar="METHOD")] = "splatting/gaussians"
-    """A method of Gaussians, whose renderer shows the model."""
     overrides: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")] = ()
-    """Change one value of the recipe, for instance --set renderer.dilation=0.1."""
     frame: Annotated[str | None, arg(metavar="opencv|opengl|z-up|RDF", help_behavior_hint="(default: as the file says)")] = None
-    """Where the file's +x, +y, +z point: opencv is right, down, forward; opengl right, up, back; z-up right, forward, up; or
-    three letters. Files that do not say (all but spz) are taken to be in the data set's world."""
     world: Annotated[str, arg(metavar="opencv|opengl|z-up|RDF")] = "opencv"
-    """Where the axes of the data set's world point, for files with certain axes; opencv fits what converters write."""
     transform: Annotated[str | None, arg(metavar="FILE.json", help_behavior_hint="(default: the same frame)")] = None
-    """Similarity from the data set's world to the file's frame: the dataparser_transforms.json that nerfstudio writes beside
-    its models (`transform`, 3 x 4, and `scale`), which its exported splats have had."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
-    """Size of the pictures; one number is the longest side."""
     test_views: Annotated[str, arg(metavar="N|all")] = "16"
-    """How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set N evenly
-    spaced ones."""
     device: Annotated[str | None, arg(metavar="cpu|cuda", help_behavior_hint="(default: cpu)")] = None
-    """Device that computes."""
     kernels: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the fastest here)")] = None
-    """Force an implementation of the hot operations: numba, or reference (plain torch)."""
     protocol: Annotated[str, arg(metavar="NAME")] = "default"
-    """How pictures are scored: default (rounded to 8 bits), or float."""
 
     def run(self) -> int:
         """Import and evaluate the file; prints scores and run folder. Returns exit status 0."""

@@ -24,32 +24,34 @@ class ImportPhotos:
     points. Where a check finds the poses suspicious, or a tenth of the photographs that match others is not placed, other
     strategies are tried and the best result is kept. An interrupted import continues when the same command is given again;
     another mapper or lens finds the features and matches of the last one in FOLDER/.import, which may be deleted.
+
+    Attributes:
+        folder: A folder of photographs, with masks of their names in `masks/` in it or beside it if there are any (dark pixels
+            do not count); or a data set, whose pictures are taken without its poses.
+        out: Folder of the scene, new or empty.
+        matching: Which pairs are compared: all of them, or each photograph with those near it in name order; auto: all, up to
+            200 photographs, or up to 500 where less than half of them could be placed.
+        mapper: How poses are found: one photograph after the other, or all at once (GLOMAP); auto: the first, and the other
+            where the result is suspicious or leaves photographs out.
+        lens: What distortion is estimated and removed; auto: radial, and pinhole and opencv where the result is suspicious or
+            leaves photographs out.
+        single_camera: All photographs share one set of intrinsics (default: those of one size and one EXIF lens do).
+        camera_per_photo: Each photograph has intrinsics of its own.
+        max_size: Longest side that pictures are reduced to.
+        truth: A data set with the true poses of these photographs, to score the recovered ones.
+        seed: Seed of all random choices.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="DIR")]
-    """A folder of photographs, with masks of their names in `masks/` in it or beside it if there are any (dark pixels do not
-    count); or a data set, whose pictures are taken without its poses."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: scenes/DIR)")] = None
-    """Folder of the scene, new or empty."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which pairs are compared: all of them, or each photograph with those near it in name order; auto: all, up to 200
-    photographs, or up to 500 where less than half of them could be placed."""
     mapper: Literal["auto", "incremental", "global"] = "auto"
-    """How poses are found: one photograph after the other, or all at once (GLOMAP); auto: the first, and the other where the
-    result is suspicious or leaves photographs out."""
     lens: Literal["auto", "pinhole", "radial", "opencv", "fisheye"] = "auto"
-    """What distortion is estimated and removed; auto: radial, and pinhole and opencv where the result is suspicious or
-    leaves photographs out."""
     single_camera: bool = False
-    """All photographs share one set of intrinsics (default: those of one size and one EXIF lens do)."""
     camera_per_photo: bool = False
-    """Each photograph has intrinsics of its own."""
     max_size: Annotated[int, arg(metavar="PIXELS")] = 1600
-    """Longest side that pictures are reduced to."""
     truth: Annotated[Path | None, arg(metavar="SCENE", help_behavior_hint="(default: the data set that DIR lies in)")] = None
-    """A data set with the true poses of these photographs, to score the recovered ones."""
     seed: int = 0
-    """Seed of all random choices."""
 
     def run(self) -> int:
         """Reconstruct; prints the quality and the scene's folder. Returns exit status 0."""

@@ -23,38 +23,40 @@ class Infer:
 
     With a photograph: the instance that it shows. Its camera has the class's lens and is that of --view, or else looks at the
     middle of the class from --azimuth and --elevation. Writes a picture of it from around, with normals, and its code.
+
+    Attributes:
+        folder: The folder of a fit to a class (`invgraphics fit prior/srn chairs`), or of a comparison or study of such fits.
+        photo: A photograph of one object, before the scene's background or with alpha.
+        views: Without a photograph: numbers of observed views from which instances are inferred.
+        test_views: Without a photograph: test views of each instance that are scored.
+        instances: Without a photograph: unseen instances, the first ones.
+        against: Without a photograph: other fits to the same class to compare with, or comparisons and studies of them.
+        no_prior: Without a photograph: also fit each instance without the prior, for so long (20s, 600steps).
+        view: The photograph's camera is that of this view of the class.
+        azimuth: The photograph's camera: angle around the vertical axis, from +x towards +y.
+        elevation: The photograph's camera: angle above the horizon.
+        steps: Steps of the optimisation of the codes.
+        scene: Another copy of the class, for instance where the data set has moved.
+        out: Where to write.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a fit to a class (`invgraphics fit prior/srn chairs`), or of a comparison or study of such fits."""
     photo: Annotated[Positional[Path | None], arg(metavar="[PHOTO]", help_behavior_hint="(default: the unseen instances)")] = (
         None
     )
-    """A photograph of one object, before the scene's background or with alpha."""
     views: Annotated[str | None, arg(metavar="N,N", help_behavior_hint="(default: 1)")] = None
-    """Without a photograph: numbers of observed views from which instances are inferred."""
     test_views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 4)")] = None
-    """Without a photograph: test views of each instance that are scored."""
     instances: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
-    """Without a photograph: unseen instances, the first ones."""
     against: Annotated[str | None, arg(metavar="RUN,RUN", help_behavior_hint="(default: none)")] = None
-    """Without a photograph: other fits to the same class to compare with, or comparisons and studies of them."""
     no_prior: Annotated[str | None, arg(metavar="BUDGET", help_behavior_hint="(default: none)")] = None
-    """Without a photograph: also fit each instance without the prior, for so long (20s, 600steps)."""
     view: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: the angles)")] = None
-    """The photograph's camera is that of this view of the class."""
     azimuth: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: -60)")] = None
-    """The photograph's camera: angle around the vertical axis, from +x towards +y."""
     elevation: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: 25)")] = None
-    """The photograph's camera: angle above the horizon."""
     steps: Annotated[int, arg(metavar="N")] = 200
-    """Steps of the optimisation of the codes."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the class, for instance where the data set has moved."""
     out: Annotated[
         Path | None, arg(metavar="FOLDER|FILE.png", help_behavior_hint="(default: RUN-inferred, PHOTO-inferred.png)")
     ] = None
-    """Where to write."""
 
     def run(self) -> int:
         """Infer; prints what was found and where it was written. Returns exit status 0."""

@@ -43,15 +43,17 @@ class List:
     """List methods, scenes and the components that recipes are made of, and where each comes from.
 
     Of one method: its paper, its presets, and every setting with its value and what it means.
+
+    Attributes:
+        kinds: What to list: methods, scenes, studies, fields, encodings, renderers, samplers, losses, penalties, hooks,
+            metrics, formats, model-formats, exporters, executors, protocols; matrix, the table of fields and renderers as
+            Markdown; or a method (volumetric/hash, volumetric/hash:preset=long, or the path of a recipe): its keys for --set,
+            under its laptop preset unless one is named.
     """
 
     kinds: Annotated[
         Positional[tuple[str, ...]], arg(metavar="[KIND|METHOD ...]", help_behavior_hint="(default: all kinds but matrix)")
     ] = ()
-    """What to list: methods, scenes, studies, fields, encodings, renderers, samplers, losses, penalties, hooks, metrics,
-    formats, model-formats, exporters, executors, protocols; matrix, the table of fields and renderers as Markdown; or a method
-    (volumetric/hash, volumetric/hash:preset=long, or the path of a recipe): its keys for --set, under its laptop preset unless
-    one is named."""
 
     def run(self) -> int:
         """Print the tables; returns exit status 0."""

@@ -19,28 +19,30 @@ class Locate:
 
     The most promising of several starts are followed from coarse to fine pictures, and the one with the smallest difference
     wins. Writes the pose as JSON and, beside it, photograph, picture and difference as PNG.
+
+    Attributes:
+        folder: The folder of a run.
+        photo: The photograph; it is cropped to the shape of the scene's pictures, unless --fov is given.
+        near: Start at this training view: its number or name.
+        start: Start at training views, or at random poses around them.
+        starts: How many of the most promising starts are followed.
+        steps: Steps of gradient descent of each start that is followed to the end.
+        fov: Horizontal field of view of the photograph.
+        seed: Seed of random starts.
+        scene: Another copy of the scene, for instance where the data set has moved.
+        out: File to write.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a run."""
     photo: Annotated[Positional[Path], arg(metavar="PHOTO")]
-    """The photograph; it is cropped to the shape of the scene's pictures, unless --fov is given."""
     near: Annotated[str | None, arg(metavar="VIEW", help_behavior_hint="(default: compares all)")] = None
-    """Start at this training view: its number or name."""
     start: Literal["views", "random"] = "views"
-    """Start at training views, or at random poses around them."""
     starts: Annotated[int, arg(metavar="N")] = 4
-    """How many of the most promising starts are followed."""
     steps: Annotated[int, arg(metavar="N")] = 300
-    """Steps of gradient descent of each start that is followed to the end."""
     fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="(default: the scene's lens)")] = None
-    """Horizontal field of view of the photograph."""
     seed: int = 0
-    """Seed of random starts."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the scene, for instance where the data set has moved."""
     out: Annotated[Path | None, arg(metavar="FILE.json", help_behavior_hint="(default: PHOTO-located.json)")] = None
-    """File to write."""
 
     def run(self) -> int:
         """Search; prints the pose, the loss, and the error where the pose is known. Returns exit status 0."""

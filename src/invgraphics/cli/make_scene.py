@@ -14,24 +14,27 @@ from invgraphics.errors import InputError
 
 @dataclass(frozen=True)
 class MakeScene:
-    """Render a scene's ground truth with Mitsuba: colour, alpha, depth, normals, points and mesh. Done once, then cached."""
+    """Render a scene's ground truth with Mitsuba: colour, alpha, depth, normals, points and mesh. Done once, then cached.
+
+    Attributes:
+        scene: A built-in scene (see `invgraphics list scenes`), or the path of a scene.toml.
+        views: Training views.
+        test_views: Test views.
+        size: Size of the pictures; one number is the longest side.
+        spp: Samples per pixel of the training views; the others keep their proportion.
+        instances: Instances of a class of objects (chairs, mugs), one seed each; a ninth of them stay unseen by the fit.
+        seed: Seed of cameras and of the renderer's noise.
+        out: Copy the data set here.
+    """
 
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
-    """A built-in scene (see `invgraphics list scenes`), or the path of a scene.toml."""
     views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
-    """Training views."""
     test_views: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
-    """Test views."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the scene's own)")] = None
-    """Size of the pictures; one number is the longest side."""
     spp: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the scene's own)")] = None
-    """Samples per pixel of the training views; the others keep their proportion."""
     instances: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: the class's own)")] = None
-    """Instances of a class of objects (chairs, mugs), one seed each; a ninth of them stay unseen by the fit."""
     seed: int = 0
-    """Seed of cameras and of the renderer's noise."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the cache only)")] = None
-    """Copy the data set here."""
 
     def run(self) -> int:
         """Render, or find in the cache; prints the data set's folder. Returns exit status 0."""

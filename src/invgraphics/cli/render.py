@@ -20,31 +20,34 @@ NAMES = ("orbit", "spiral", "interpolate", "timelapse")
 
 @dataclass(frozen=True)
 class Render:
-    """Film a finished run: around the scene, within the photographs' window, from one to the next, or the fit itself."""
+    """Film a finished run: around the scene, within the photographs' window, from one to the next, or the fit itself.
+
+    Attributes:
+        folder: The folder of a run.
+        out: File to write.
+        path: The camera's path: orbit where photographs surround the subject, spiral where they face one way, else interpolate
+            from photograph to photograph; or a file that `invgraphics view` saved. A timelapse stands still and shows the
+            states that `fit --snapshots N` kept; of Gaussians also the ellipsoids.
+        show: What the pictures show; depth in world units, which are printed, and in one range for all.
+        frames: Pictures of a path; a timelapse has one of each state.
+        fps: Pictures per second.
+        size: Size of the pictures; one number is the longest side.
+        view: Test view that a timelapse shows; for --path timelapse only.
+        scene: Another copy of the scene, for instance where the data set has moved.
+    """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a run."""
     out: Annotated[Path, arg(metavar="FILM.mp4")]
-    """File to write."""
     path: Annotated[
         str | None,
         arg(metavar="orbit|spiral|interpolate|timelapse|FILE.json", help_behavior_hint="(default: what suits the capture)"),
     ] = None
-    """The camera's path: orbit where photographs surround the subject, spiral where they face one way, else interpolate from
-    photograph to photograph; or a file that `invgraphics view` saved. A timelapse stands still and shows the states that
-    `fit --snapshots N` kept; of Gaussians also the ellipsoids."""
     show: Literal["prediction", "depth", "normal"] = "prediction"
-    """What the pictures show; depth in world units, which are printed, and in one range for all."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 90, or the duration of FILE.json)")] = None
-    """Pictures of a path; a timelapse has one of each state."""
     fps: Annotated[int, arg(metavar="N")] = 15
-    """Pictures per second."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT|N", help_behavior_hint="(default: the run's own)")] = None
-    """Size of the pictures; one number is the longest side."""
     view: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 0)")] = None
-    """Test view that a timelapse shows; for --path timelapse only."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the scene, for instance where the data set has moved."""
 
     def run(self) -> int:
         """Render the film and print its path; returns exit status 0."""

@@ -27,16 +27,20 @@ FIRST_SHOWN = ("psnr", "ssim", "normal_deg", "chamfer", "fit_seconds", "render_f
 
 @dataclass(frozen=True)
 class Report:
-    """Write a report from a comparison's folder, from a study's folder, or from single runs on the same ground truth."""
+    """Write a report from a comparison's folder, from a study's folder, or from single runs on the same ground truth.
+
+    Attributes:
+        folders: The folder of one comparison or of one study, or folders of runs.
+        out: Where to write; needed for single runs, which have no folder of their own for a report.
+        public: Leave out absolute paths, user names and host names; writes to FOLDER-public unless --out says otherwise.
+        check: Write nothing: say which of these reports, or of the reports in these folders, were made by recipes that have
+            changed.
+    """
 
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN ...", help_behavior_hint="(required)")]
-    """The folder of one comparison or of one study, or folders of runs."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: the folder itself)")] = None
-    """Where to write; needed for single runs, which have no folder of their own for a report."""
     public: bool = False
-    """Leave out absolute paths, user names and host names; writes to FOLDER-public unless --out says otherwise."""
     check: bool = False
-    """Write nothing: say which of these reports, or of the reports in these folders, were made by recipes that have changed."""
 
     def run(self) -> int:
         """Write the report and print the page's path; returns exit status 0, or 1 where a check finds a stale report."""

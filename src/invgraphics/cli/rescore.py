@@ -20,21 +20,25 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 @dataclass(frozen=True)
 class Rescore:
-    """Score saved pictures again under named protocols: those of a run, or of any tool. `list protocols` explains them."""
+    """Score saved pictures again under named protocols: those of a run, or of any tool. `list protocols` explains them.
+
+    Attributes:
+        folders: Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ +
+            gt-color/ contain their truth). Several must share their truth.
+        protocol: Protocols, with commas between them.
+        truth: True pictures, matched by equal names, else in order.
+        background: The data set's background, and what pictures without alpha show where the scene is transparent; runs know
+            theirs.
+        allow_8bit: Accept 8-bit pictures where a protocol needs unrounded predictions.
+        out: Where to write scores, and the table as Markdown and CSV.
+    """
 
     folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|FOLDER ...", help_behavior_hint="(one or more)")]
-    """Runs, comparisons, or folders of predicted pictures (3DGS's renders/ + gt/ and nerfbaselines' color/ + gt-color/ contain
-    their truth). Several must share their truth."""
     protocol: Annotated[str, arg(metavar="NAME,NAME|all")] = "all"
-    """Protocols, with commas between them."""
     truth: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the folder's own)")] = None
-    """True pictures, matched by equal names, else in order."""
     background: Annotated[str | None, arg(metavar="white|black|R,G,B", help_behavior_hint="(default: not stated)")] = None
-    """The data set's background, and what pictures without alpha show where the scene is transparent; runs know theirs."""
     allow_8bit: bool = False
-    """Accept 8-bit pictures where a protocol needs unrounded predictions."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: into the run)")] = None
-    """Where to write scores, and the table as Markdown and CSV."""
 
     def run(self) -> int:
         """Score; prints a table for each set of pictures. Returns exit status 0."""

@@ -21,27 +21,29 @@ class View:
     """View a run in a browser, or two of one scene side by side: at reduced resolution while moving, at full size at rest.
 
     Shows prediction, truth, error, depth and normals, and the photographs where they were taken. Ctrl-C stops it.
+
+    Attributes:
+        folder: The folder of a run.
+        other: Another run of the same scene, to compare.
+        live: Follow a fit that runs in another process: wait for its first checkpoint, and show each newer one when it is
+            written (fit --checkpoint-every 5s writes them more often).
+        view: Test view to start at.
+        host: Address to listen at. The default is reachable from this machine only; 0.0.0.0 from any machine.
+        port: Port to listen at; 0 for any that is free.
+        max_size: Most pixels along the pictures' longer side.
+        no_open: Do not open the page in a browser.
+        scene: Another copy of the scene, for instance where the data set has moved.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """The folder of a run."""
     other: Annotated[Positional[Path | None], arg(metavar="[RUN2]", help_behavior_hint="(default: none)")] = None
-    """Another run of the same scene, to compare."""
     live: bool = False
-    """Follow a fit that runs in another process: wait for its first checkpoint, and show each newer one when it is written
-    (fit --checkpoint-every 5s writes them more often)."""
     view: Annotated[int, arg(metavar="N")] = 0
-    """Test view to start at."""
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at. The default is reachable from this machine only; 0.0.0.0 from any machine."""
     port: Annotated[int, arg(metavar="N")] = 8080
-    """Port to listen at; 0 for any that is free."""
     max_size: Annotated[int, arg(metavar="N")] = 800
-    """Most pixels along the pictures' longer side."""
     no_open: Annotated[bool, arg(help_behavior_hint="(default: it is opened, where there is a screen)")] = False
-    """Do not open the page in a browser."""
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
-    """Another copy of the scene, for instance where the data set has moved."""
 
     def run(self) -> int:
         """Serve until Ctrl-C; returns exit status 0."""
