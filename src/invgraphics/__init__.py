@@ -31,12 +31,16 @@ if TYPE_CHECKING:
     from invgraphics.core import Rendering as Rendering
     from invgraphics.core import Scene as Scene
     from invgraphics.core import View as View
+    from invgraphics.errors import InputError as InputError
+    from invgraphics.errors import NumericalError as NumericalError
     from invgraphics.plugins import register as register
 
 __all__ = [
     "Camera",
     "Gaussians",
+    "InputError",
     "Model",
+    "NumericalError",
     "Rendering",
     "Scene",
     "View",
@@ -55,7 +59,9 @@ __all__ = [
 _HOMES = {
     "Camera": "invgraphics.core",
     "Gaussians": "invgraphics.core",
+    "InputError": "invgraphics.errors",
     "Model": "invgraphics.core",
+    "NumericalError": "invgraphics.errors",
     "Rendering": "invgraphics.core",
     "Scene": "invgraphics.core",
     "View": "invgraphics.core",

@@ -12,7 +12,7 @@ _CGROUP = Path("/sys/fs/cgroup")
 STATM, STATUS, CLEAR = (Path("/proc/self") / name for name in ("statm", "status", "clear_refs"))
 """Linux: sizes of this process in pages, its peaks, and the file that sets the resident set's peak back to the present."""
 _RESET = "5"
-_SHARE = 0.8  # of the available memory that one request may take: the rest is for what it forgets to count
+_SHARE = 0.8  # of the available memory that one request may take: the rest is for allocations that a forecast leaves out
 
 
 def total_bytes() -> int:

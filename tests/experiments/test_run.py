@@ -257,7 +257,7 @@ def test_a_fit_without_an_objective_is_refused(toy_folder: Path, tmp_path: Path,
 
 
 def test_existing_runs_are_not_overwritten(run: Path, toy_folder: Path) -> None:
-    with pytest.raises(InputError, match="already holds a run"):
+    with pytest.raises(InputError, match="holds this fit, finished"):
         fit_run(_request(toy_folder, run))
     with pytest.raises(InputError, match="holds another run: its seed is 0, not 5"):
         fit_run(_request(toy_folder, run, seed=5, existing="resume"))
@@ -338,7 +338,7 @@ def test_a_fit_goes_on_by_other_code_where_that_is_asked_for(
     (folder / "scores.json").unlink()
     for user in ("identity", "run", "environment"):
         monkeypatch.setattr(f"invgraphics.experiments.{user}.code_version", lambda: "9.9+later")
-    with pytest.raises(InputError, match=r"of other code, packages, threads or kernels, or from another source\.\nAdd --keep"):
+    with pytest.raises(InputError, match=r"from another source: it was made by .*; this is .*, \d+ threads?\.\nAdd --keep"):
         fit_run(_request(toy_folder, folder, existing="resume"))
     record = json.loads((folder / "provenance.json").read_text())
     (folder / "provenance.json").write_text(json.dumps(record | {"train_sha256": "0" * 64}))

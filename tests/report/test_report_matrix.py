@@ -118,7 +118,7 @@ def test_a_pattern_leaves_out_what_does_not_go_with_the_scene(tmp_path: Path, mo
         scene="toy",
         methods=named,
         optional=frozenset(named[:2]),
-        asked="splatting/*",
+        requested="splatting/*",
         out=str(tmp_path),
         overrides=("batches.opaque=false",),
     )

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Unpack
 
-from invgraphics.api.keeping import Kept, reopenable_scene
+from invgraphics.api.keeping import ReuseOptions, reopenable_scene
 from invgraphics.api.loading import (
     MethodLike,
     as_scene,
@@ -116,7 +116,7 @@ def compare(
     device: Literal["cpu", "cuda"] | None = None,
     render_with: Sequence[str] | str = (),
     data: Mapping[str, Any] | None = None,
-    **more: Unpack[Kept],
+    **more: Unpack[ReuseOptions],
 ) -> ComparisonResult:
     """Fit several methods to one scene under one budget, each in its own process, and write a report.
 

@@ -25,8 +25,8 @@ from invgraphics.runs.folder import RECIPE, RunFolder
 from invgraphics.scenes.open import source_of
 
 
-class Kept(TypedDict, total=False):
-    """What a run's folder keeps besides, on request.
+class FolderOptions(TypedDict, total=False):
+    """Options of a fit that keeps a run folder.
 
     Attributes:
         snapshots: states of the model, for a time-lapse.
@@ -60,7 +60,7 @@ def fit(
     device: Literal["cpu", "cuda"] | None = ...,
     data: Mapping[str, Any] | None = ...,
     on_step: OnStep | None = ...,
-    **kept: Unpack[Kept],
+    **kept: Unpack[FolderOptions],
 ) -> FolderRun: ...
 def fit(
     method: MethodLike,
@@ -72,9 +72,11 @@ def fit(
     device: Literal["cpu", "cuda"] | None = None,
     data: Mapping[str, Any] | None = None,
     on_step: OnStep | None = None,
-    **kept: Unpack[Kept],
+    **kept: Unpack[FolderOptions],
 ) -> MemoryRun | FolderRun:
     """Fit a method to a scene in this process, with a progress bar.
+
+    Size, test views and samples per pixel are chosen by `load_scene`, preset and values of the recipe by `load_method`.
 
     Ctrl-C, or a notebook's stop button, ends the fit after a whole step and returns it as it is. Without ``out``,
     `MemoryRun.resume` goes on; with ``out``, the same call goes on from the folder's checkpoint, and opens what is finished.

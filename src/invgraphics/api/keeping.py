@@ -18,8 +18,8 @@ CAMERA = ("cam_to_world", "focal", "principal_point")
 """Tensors of a camera; its size is that of the picture."""
 
 
-class Kept(TypedDict, total=False):
-    """What a comparison or a study keeps of an earlier call.
+class ReuseOptions(TypedDict, total=False):
+    """Options of a comparison or study whose folder holds fits of an earlier call.
 
     Attributes:
         keep: whether finished fits stay although code or packages have changed since.

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Unpack
 
-from invgraphics.api.keeping import Kept
+from invgraphics.api.keeping import ReuseOptions
 from invgraphics.api.loading import whole_seeds
 from invgraphics.errors import InputError
 from invgraphics.experiments.request import AblateRequest
@@ -110,7 +110,7 @@ def ablate(
     device: Literal["cpu", "cuda"] | None = None,
     jobs: int = 1,
     confirm: Callable[[Forecast], None] = _announce,
-    **more: Unpack[Kept],
+    **more: Unpack[ReuseOptions],
 ) -> StudyResult:
     r"""Run every cell of a study that is missing, and write its report.
 

@@ -43,7 +43,7 @@ class Ablate:
             N evenly spaced ones.
         spp: Samples per pixel of the training views of scenes that are rendered.
         device: Device that computes.
-        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+        kernels: Force an implementation of the hot operations: numba, reference (plain torch), or cuda with --device cuda.
         checkpoint_every: Interval between checkpoints, the most work that an interruption costs.
         keep: Keep finished cells whose recipe, scene and request are the same although the code has changed since.
         cells: Run only the cells whose label METHOD SCENE@SIZE BUDGET seed=N fits, for instance 'splatting/* fence@400 *'.

@@ -51,7 +51,7 @@ class Shared:
             training.poses.optimise=true and --set training.exposure.optimise=true. Exposures are fitted unasked where those of
             a COLMAP reconstruction's photographs differ.
         device: Device that computes.
-        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+        kernels: Force an implementation of the hot operations: numba, reference (plain torch), or cuda with --device cuda.
         protocol: How pictures are scored: default (rounded to 8 bits), or float.
         checkpoint_every: Interval between checkpoints, the most work that an interruption costs.
         render_with: Show the fitted fields through the renderers of other methods, too; METHOD:key=value changes a renderer's

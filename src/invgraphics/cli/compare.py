@@ -73,7 +73,7 @@ class Compare(Shared):
             keep=self.keep,
             **self.settings(),
         )
-        return replace(request, asked=self.methods or "") if optional else request
+        return replace(request, requested=self.methods or "") if optional else request
 
 
 def _report_what_is_finished(folder: Path) -> None:

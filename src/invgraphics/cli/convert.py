@@ -34,7 +34,7 @@ class Convert:
         overrides: Change one value of the method's recipe.
         seed: Seed of the sampling and of the refit.
         scene: Another copy of the scene, for instance where the data set has moved.
-        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+        kernels: Force an implementation of the hot operations: numba, reference (plain torch), or cuda with --device cuda.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]

@@ -33,7 +33,7 @@ class ImportFile:
         test_views: How many test views are scored: of a built-in scene the first N, which are evenly distributed; of a data set
             N evenly spaced ones.
         device: Device that computes.
-        kernels: Force an implementation of the hot operations: numba, or reference (plain torch).
+        kernels: Force an implementation of the hot operations: numba, reference (plain torch), or cuda with --device cuda.
         protocol: How pictures are scored: default (rounded to 8 bits), or float.
     """
 

@@ -98,12 +98,14 @@ def run(arguments: Sequence[str], debug: bool = False) -> int:
 
 
 def _dispatch(arguments: Sequence[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    if not arguments or arguments[0] in ("-h", "--help") or arguments == ["help"]:
         print(overview())
         return DONE
     if arguments[0] == "--version":
         print(version("invgraphics"))
         return DONE
+    if arguments[0] == "help":
+        arguments = [*arguments[1:], "--help"]
     name, *rest = arguments
     return parse(_command(name), f"invgraphics {name}", rest).run()
 

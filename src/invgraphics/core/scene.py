@@ -138,7 +138,7 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything a fit and its evaluation may know.
+    """Posed views in splits, with bounds, background and known geometry: all that a fit and its evaluation use.
 
     Attributes:
         name: short name.

@@ -20,7 +20,7 @@ LEAST_READY = 0.2
 
 
 class PictureClock:
-    """Times pictures as a viewer renders them, and what the processor gave this process meanwhile.
+    """Times pictures as a viewer renders them, and measures the process's CPU share meanwhile.
 
     Attributes:
         seconds: of each picture.
@@ -103,8 +103,8 @@ def at_step(fit: FitRecord, steps: int) -> FitRecord:
 def processor_share(fit: FitRecord) -> float | None:
     """CPU share of a fit: running time over runnable time, in [0, 1]; ``None`` where unknown.
 
-    From the scheduler's own times (see `training.clock`), else from the load average at the end: cores per process that wants
-    one, which counts other programs' processes that wait for a disk as well.
+    From the scheduler's own times (see `training.clock`), else from the load average at the end: cores per runnable
+    process, which counts other programs' processes that wait for a disk as well.
     """
     if fit.ran_seconds is not None and fit.waited_seconds is not None and fit.ran_seconds + fit.waited_seconds > 0:
         return fit.ran_seconds / (fit.ran_seconds + fit.waited_seconds)

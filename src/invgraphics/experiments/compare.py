@@ -198,7 +198,10 @@ def _refusal(request: CompareRequest, method: str, error: InputError) -> Refusal
     """Record of an optional method's refusal; raises the error of any other, with its name."""
     if method not in request.optional:
         sentence = error.sentence if method in error.sentence else f"{method}: {error.sentence}"
-        raise InputError(sentence, error.remedy) from error
+        remedy = error.remedy
+        if error.sentence.startswith("Unknown key") and len(request.methods) > 1:
+            remedy += f"\nA key of one method only is part of its name: --methods {method}:KEY=VALUE,OTHER."
+        raise InputError(sentence, remedy) from error
     return Refusal(method=method, reason=error.sentence)
 
 

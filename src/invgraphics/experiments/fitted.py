@@ -151,7 +151,7 @@ def _method(folder: RunFolder, provenance: Provenance) -> Method:
         modules = ",".join(package.removeprefix("module ") for package in missing if package.startswith("module "))
         remedy = "Install the package here."
         if modules:
-            remedy = f"Set INVGRAPHICS_MODULES={modules} where it can be imported."
+            remedy = f"Set INVGRAPHICS_MODULES={modules}, and run `python -m invgraphics` in the folder that holds it."
         elif plugins.ANONYMOUS in missing:
             remedy = "Register the parts again by ig.register."
         raise InputError(sentence, remedy) from error

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from invgraphics import kernels, plugins
@@ -180,8 +181,9 @@ def check_resumable(job: Job, scene: Scene, training_scene: Scene) -> None:
     if seen != (found.truth_sha256, found.train_sha256, found.cameras_sha256):
         raise InputError(f"{folder.root} holds a run of other pictures of the same scene.", other)
     if not job.request.keep:
-        what = f"{folder.root} holds a run of other code, packages, threads or kernels, or from another source."
-        raise InputError(what, f"Add --keep to go on with it. {other}")
+        what = f"{folder.root} holds a run of other code, packages, threads or kernels, or from another source"
+        made = f"it was made by {earlier_code(job)}; this is {code_version()}, {_threads(torch.get_num_threads())}"
+        raise InputError(f"{what}: {made}.", f"Add --keep to go on with it. {other}")
 
 
 def earlier_code(job: Job) -> str:
@@ -189,9 +191,13 @@ def earlier_code(job: Job) -> str:
     found = job.folder.read(Provenance)
     packages = ", ".join(sorted(set(found.plugins.values())))
     same = found.code_version == code_version()
-    threads = "" if found.threads is None else f", {found.threads} thread{'s' if found.threads > 1 else ''}"
+    threads = "" if found.threads is None else f", {_threads(found.threads)}"
     ours = f"{'the same ' if same else ''}invgraphics{'' if same else f' {found.code_version}'}{threads}"
     return f"{ours} with {packages}" if packages else ours
+
+
+def _threads(count: int) -> str:
+    return f"{count} thread{'s' * (count != 1)}"
 
 
 def _normalised(budget: str) -> str:
@@ -211,11 +217,25 @@ def check_existing(job: Job) -> None:
     folder, request = job.folder, job.request
     present = folder.has(Provenance)
     if request.existing == "refuse" and present:
-        raise InputError(f"{folder.root} already holds a run.", "Add --resume to continue it, or choose another --out.")
+        check_replaceable(job)
+        if folder.finished:
+            remedy = f"`invgraphics evaluate {folder.root}` scores it again; or choose another --out."
+            raise InputError(f"{folder.root} holds this fit, finished.", remedy)
+        raise InputError(f"{folder.root} holds this fit, unfinished.", "Add --resume to continue it, or choose another --out.")
     if request.existing == "resume" and not present:
         raise InputError(f"{folder.root} holds no run to resume.", "Leave out --resume to start one.")
     if request.existing != "refuse":
         check_replaceable(job)
+
+
+def check_unused(folder: RunFolder) -> None:
+    """Refuse a folder that holds a run.
+
+    Raises:
+        InputError: it does.
+    """
+    if folder.has(Provenance):
+        raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
 
 
 def check_truth(folder: RunFolder, scene: Scene, spec: str | None) -> None:

@@ -127,7 +127,7 @@ class Recorder:
             NumericalError: the fit left the finite numbers; the history and the last checkpoint remain.
         """
         self._stopped_by = 0
-        # Only a program's main thread hears signals.
+        # Signal handlers can be installed in the main thread only.
         numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
         before = {number: signal.signal(number, self._stop) for number in numbers}
         try:

@@ -181,14 +181,14 @@ class CompareRequest(Settings):
         methods: in the order of the report; empty leaves the choice to the scene (`recipes.suitable`).
         seeds: each method is fitted once per seed.
         optional: methods that are skipped, with the reason, where they do not go with the scene; others are an error.
-        asked: the methods as requested, patterns included; empty for ``methods`` themselves.
+        requested: the methods as requested, patterns included; empty for ``methods`` themselves.
         keep: whether finished runs are kept although the code has changed since, if recipe, scene and request are the same.
     """
 
     methods: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
     optional: frozenset[str] = frozenset()
-    asked: str = ""
+    requested: str = ""
     keep: bool = False
 
     def __post_init__(self) -> None:
@@ -211,7 +211,7 @@ class CompareRequest(Settings):
 
     def shell(self) -> str:
         """Shell command that repeats this comparison."""
-        chosen = ["--methods", self.asked or ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
+        chosen = ["--methods", self.requested or ",".join(self.methods), "--seeds", ",".join(map(str, self.seeds))]
         kept = ["--keep"] if self.keep else []
         return shlex.join(["invgraphics", "compare", self.scene, *chosen, *self.flags(), *kept])
 

@@ -64,6 +64,16 @@ class FittedRun(ABC):
         """
 
     @property
+    def steps(self) -> int:
+        """Training steps so far."""
+        return self.history[-1].step if self.history else 0
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of optimisation so far."""
+        return self.history[-1].seconds if self.history else 0.0
+
+    @property
     @abstractmethod
     def finished(self) -> bool:
         """Whether the budget is spent."""
@@ -113,9 +123,8 @@ class FittedRun(ABC):
         return replace(self.model, field=as_shown(self.model.field, other), renderer=other)
 
     def __repr__(self) -> str:
-        last = self.history[-1] if self.history else Moment(step=0, seconds=0.0)
         state = "finished" if self.finished else "not finished"
-        return f"{self.method.name} on {self.scene.name}: {state}, {last.step} steps, {last.seconds:.1f} s"
+        return f"{self.method.name} on {self.scene.name}: {state}, {self.steps} steps, {self.seconds:.1f} s"
 
     def _repr_svg_(self) -> str:
         points = [(moment.seconds, moment.psnr) for moment in self.history if moment.psnr is not None]
@@ -175,6 +184,9 @@ class MemoryRun(FittedRun):
         """
         if budget is not None:
             self.fit.set_budget(Budget.parse(budget))
+        if self.finished:
+            spent = f"{self.steps} steps and {self.seconds:.1f} s are done, the whole budget of {self.fit.plan.budget}"
+            print(f"Nothing to resume: {spent}.", file=sys.stderr)
         self._run()
 
     @property

@@ -17,7 +17,7 @@ OBSERVED = 1
 def check_subjects(field: Field, renderer: Renderer, scene: Scene, method: str) -> None:
     """Check that a class of objects meets a field with codes, and a single subject one without.
 
-    An occupancy grid would know the mean code's cells only, and cull those of the instances.
+    An occupancy grid would cover the mean code's cells only, and cull those of the instances.
 
     Raises:
         InputError: names the method and the scene.

@@ -18,7 +18,8 @@ from invgraphics.fields.mlp import Mlp
 from invgraphics.fields.settings import NeuralSettings
 
 NEUS_SHARPNESS, EG3D_SHARPNESS = 100.0, 1.0
-"""Of the softplus of hidden layers; NeuS's is that of a signed distance, whose gradient must have one itself."""
+"""Softplus beta of hidden layers: 100 for signed distances (NeuS), whose eikonal loss needs a second derivative; 1 for
+tri-planes (EG3D)."""
 
 
 def geometry_net(settings: NeuralSettings, inputs: int) -> Mlp:

@@ -1,4 +1,4 @@
-"""Whose fault an unexpected error is: that of a third-party part, or ours."""
+"""Attribution of unexpected errors to a third-party part or to invgraphics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def raised_in(error: BaseException) -> str:
 
 
 def unexpected(error: BaseException) -> tuple[str, str]:
-    """What an error is that no input should cause, and whose fault: of a plug-in where it was raised in one, or may be."""
+    """Describe an unexpected exception and attribute it to a plug-in, if it was raised in one or may be, or to invgraphics."""
     first = (str(error).splitlines() or [""])[0]
     if where := raised_in(error):
         fault = f"It was raised in {where}"

@@ -94,7 +94,11 @@ def _import_modules(modules: str) -> None:
         try:
             importlib.import_module(module)
         except Exception as error:  # it may raise anything
-            raise InputError(f"The module '{module}', which ${MODULES} names, cannot be imported: {error!r}.") from error
+            remedy = (
+                "`python -m invgraphics` finds modules of the current folder, `invgraphics` those in folders of PYTHONPATH."
+            )
+            sentence = f"The module '{module}', which ${MODULES} names, cannot be imported: {error!r}."
+            raise InputError(sentence, remedy if isinstance(error, ModuleNotFoundError) else "") from error
 
 
 def environment() -> dict[str, str]:

@@ -48,19 +48,19 @@ def preset_for(budget: Budget | None, known: Collection[str]) -> str:
     return fitting[-1] if fitting else ""
 
 
-def select_preset(method: str, asked: str | None, budget: Budget | None, known: Mapping[str, Any]) -> Preset:
+def select_preset(method: str, requested: str | None, budget: Budget | None, known: Mapping[str, Any]) -> Preset:
     """Select the preset by name, or else by the budget.
 
     Args:
         method: name of the recipe, for the sentence of an error.
-        asked: the named preset; empty for none at all, ``None`` leaves the choice to the budget.
+        requested: the named preset; empty for none at all, ``None`` leaves the choice to the budget.
         budget: of the fit; ``None`` where there is none.
         known: the recipe's presets and their tables.
 
     Raises:
         InputError: the recipe has no such preset, or ``chosen_on`` is no list of names.
     """
-    name = preset_for(budget, known) if asked is None else asked
+    name = preset_for(budget, known) if requested is None else requested
     if name and name not in known:
         raise InputError(
             f"{method} has no preset '{name}'.{did_you_mean(name, known)}", f"Its presets: {', '.join(known) or 'none'}."
@@ -69,7 +69,7 @@ def select_preset(method: str, asked: str | None, budget: Budget | None, known: 
     scenes = table.pop(CHOSEN_ON, [])
     if not isinstance(scenes, list) or not all(isinstance(scene, str) for scene in scenes):
         raise InputError(f"'presets.{name}.{CHOSEN_ON}' of {method} cannot be {scenes!r}.", 'Expected: ["scene", ...].')
-    choice = "" if asked is not None or budget is None or not name else _choice(budget)
+    choice = "" if requested is not None or budget is None or not name else _choice(budget)
     return Preset(name, choice, tuple(scenes), table)
 
 

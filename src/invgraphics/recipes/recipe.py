@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from invgraphics import plugins
 from invgraphics.config import fill, merge, set_path, to_table
 from invgraphics.data import find
-from invgraphics.errors import InputError
+from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.aliases import suggested_method
 from invgraphics.recipes.presets import select_preset
 from invgraphics.recipes.renamed import ADDED_KEYS, with_current_names, with_first_names
@@ -155,11 +155,27 @@ def method_from(
     plain = merge(table, chosen.table)
     changed = copy.deepcopy(plain)
     assign(changed, (*overrides, *own))
+    _check_groups(name, plain, changed)
     try:
         method = resolve(name, chosen.name, changed)
     except InputError as error:
         raise _of_its_file(error, name, plain) from error
     return replace(method, preset_choice=chosen.choice, chosen_on=chosen.chosen_on)
+
+
+def _check_groups(name: str, table: Mapping[str, Any], changed: Mapping[str, Any]) -> None:
+    """Check that overrides name parameter groups that the recipe has, or say what a new one matches.
+
+    Raises:
+        InputError: names the first that is neither.
+    """
+    known, groups = (each.get("optimiser", {}).get("groups", {}) for each in (table, changed))
+    for group in groups:
+        if group not in known and "match" not in groups[group]:
+            sentence = f"{name} has no parameter group '{group}'.{did_you_mean(group, known)}"
+            new = f"A new one needs --set optimiser.groups.{group}.match=PARAMETER, too."
+            remedy = f"Its groups: {', '.join(known) or 'none'}. {new}"
+            raise InputError(sentence, remedy)
 
 
 def _of_its_file(error: InputError, name: str, table: dict[str, Any]) -> InputError:
@@ -221,7 +237,10 @@ def source(name: str) -> dict[str, Any]:
             return _foreign_source(name)
         if not path.is_file():
             known = methods()
-            sentence = f"There is no method '{name}'.{suggested_method(name, known)}"
+            guess = suggested_method(name, known)
+            if (find("scenes") / name / "scene.toml").is_file():
+                guess = f" '{name}' is a scene; the order is `fit METHOD SCENE`."
+            sentence = f"There is no method '{name}'.{guess}"
             others = "Those of other packages are known once the package is installed."
             raise InputError(sentence, f"Known methods: {', '.join(known)}; or the path of a .toml. {others}")
     return _parse(read_text(path, LIMITS.toml_bytes), str(path))

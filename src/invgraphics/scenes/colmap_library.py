@@ -15,6 +15,6 @@ __all__ = ["pycolmap"]
 pycolmap.logging.minloglevel = 2
 
 _listener = signal.getsignal(signal.SIGTERM)
-# Python knows nothing of the change; only its main thread may speak of signals.
+# pycolmap has replaced the handler; signal handlers can be set in the main thread only.
 if _listener is not None and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGTERM, _listener)

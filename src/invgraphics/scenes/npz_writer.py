@@ -13,6 +13,9 @@ from invgraphics.files import write_arrays
 from invgraphics.scenes.border import background_of
 from invgraphics.scenes.npz import MOST_CHARACTERS
 
+MESH = "a mesh"
+"""What keeps a scene that was rendered from being written, in words."""
+
 
 def save_npz(scene: Scene, path: Path) -> None:
     """Write a scene as one ``.npz`` file that `load_scene` reads as the same, in the same units; colours of points have 8 bits.
@@ -20,13 +23,15 @@ def save_npz(scene: Scene, path: Path) -> None:
     Not kept: names of views, spread of exposures, noise level, and which photographs show which points.
 
     Raises:
-        InputError: it holds what the convention does not: no box, linear or unrounded colours, masks, another
-            background, pictures of several sizes; the sentence says what. Nothing is written then.
+        InputError: it holds what the convention does not: no box, linear or unrounded colours, masks, a mesh,
+            another background, pictures of several sizes; the sentence says what. Nothing is written then.
     """
     if beyond := unsupported_parts(scene):
         raise InputError(
             f"The scene '{scene.name}' cannot be kept as a data set: it has {beyond}.",
-            "Write it in a format that `load_scene` reads, and load it from there.",
+            "Leave it out by dataclasses.replace(scene, mesh=None)."
+            if beyond == MESH
+            else "Write it in a format that `load_scene` reads, and load it from there.",
         )
     views = [*scene.train, *scene.val, *scene.test, *scene.observed]
     ends = np.cumsum([len(split) for split in (scene.train, scene.val, scene.test, scene.observed)])
@@ -69,7 +74,7 @@ def unsupported_parts(scene: Scene) -> str:
             values.dtype != torch.uint8 for view in views for values in (view.image, view.alpha) if values is not None
         ),
         "masks": any(view.mask is not None for view in views),
-        "a mesh": scene.mesh is not None,
+        MESH: scene.mesh is not None,
         f"{' and '.join(mixed)} for some views only": bool(mixed),
         "pictures of several sizes": len({(camera.width, camera.height) for camera in cameras}) > 1,
         "a background other than the default": not torch.equal(scene.background, background_of(views)),

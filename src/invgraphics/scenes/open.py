@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from weakref import WeakKeyDictionary
 
 from invgraphics import plugins
 from invgraphics.core import Scene
+from invgraphics.data import find
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions, evenly
 from invgraphics.scenes.pictures.images import image_files
@@ -98,16 +100,28 @@ def _load(spec: str, options: SceneOptions, progress: Callable[[int, int, str], 
     path = _path(spec)
     if not path.exists():
         if reason := missing_data_reason(spec):
-            raise InputError(f"'{spec}' cannot be opened: {reason}.", "Set the variable to the folder that holds it.")
-        guess = did_you_mean(spec, _built_in())
-        if os.environ.get(DATA) and (Path(os.environ[DATA]) / spec).exists():
-            guess = f" Did you mean '${DATA}/{spec}'?"
+            folder = _path(spec).parent
+            there = sorted(each.name for each in folder.iterdir()) if folder.is_dir() else []
+            remedy = f"It holds {', '.join(there[:20])}." if there else "Set the variable to the folder that holds it."
+            raise InputError(f"'{spec}' cannot be opened: {reason}.", remedy)
         raise InputError(
-            f"'{spec}' is neither a built-in scene nor an existing path.{guess}", f"Built-in scenes: {', '.join(_built_in())}."
+            f"'{spec}' is neither a built-in scene nor an existing path.{_guess(spec)}",
+            f"Built-in scenes: {', '.join(_built_in())}. Real captures: '${DATA}/NAME' (docs/files.md, Real data).",
         )
     if options.spp is not None:
         raise InputError(f"{path} holds pictures, whose samples per pixel are what they are.", "Leave out --spp.")
     return _loaded(find_loader(path), path, options)
+
+
+def _guess(spec: str) -> str:
+    """What a name that is no scene's may mean, as a sentence after a space; empty where nothing is like it."""
+    if (find("renderers") / f"{spec}.toml").is_file():
+        return f" '{spec}' is a method; the order is `fit METHOD SCENE`, `compare SCENE --methods A,B`."
+    if os.environ.get(DATA) and len(spec) > 2 and "/" not in spec:
+        captures = sorted(path.name for path in Path(os.environ[DATA]).glob(f"*{glob.escape(spec)}*"))
+        if captures:
+            return f" Did you mean '${DATA}/{spec if spec in captures else captures[0]}'?"
+    return did_you_mean(spec, _built_in())
 
 
 def find_loader(path: Path) -> Loader:

@@ -65,7 +65,7 @@ class Truth:
             )
             for split, count in wanted.items()
         }
-        # Points are made from the depth of all training views: of fewer, they know too much.
+        # Points are made from the depth of all training views: with fewer, they would leak views that are left out.
         known = _points(path / "points.npz")
         points = known if len(views["train"]) == len(truth["cameras"]["train"]) else None
         return Scene(

@@ -108,9 +108,9 @@ def _cell_record(planned: Planned, before: CellRecord | None) -> CellRecord:
     )
 
 
-def summarise_study(study: Study, name: str, asked: tuple[AblateRequest, Resources], job: Job) -> StudyRecord:
+def summarise_study(study: Study, name: str, made_by: tuple[AblateRequest, Resources], job: Job) -> StudyRecord:
     """Make a study's record, without its cells; ``job`` is one of theirs."""
-    request, resources = asked
+    request, resources = made_by
     machine = environment(job.device)
     return StudyRecord(
         name=name,

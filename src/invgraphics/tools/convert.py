@@ -15,6 +15,7 @@ from invgraphics.experiments.clocks import fit_costs, fit_record
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate, score_model
 from invgraphics.experiments.fitted import Fitted, open_fitted
+from invgraphics.experiments.identity import check_unused
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.recorder import Recorder
 from invgraphics.experiments.request import DATA, FitRequest
@@ -113,7 +114,7 @@ def convert_run(request: ConvertRequest) -> Converted:
         raise InputError(sentence, "Convert a run that was fitted without --optimise poses.")
     job = _job(request, fitted)
     folder = job.folder
-    _check_empty(folder)
+    check_unused(folder)
     configure_torch(job.device)
     use_kernels(request.kernels, job.device)
     shown = degrade(fitted.scene, job.data, fitted.folder.read(Provenance).data_seed)
@@ -126,7 +127,7 @@ def convert_run(request: ConvertRequest) -> Converted:
     converted = _scores(plan.model, fitted, f"{job.method.name} as converted")
     folder.create()
     with folder.held():
-        _check_empty(folder)
+        check_unused(folder)
         folder.clear()
         origin = _origin(request, fitted, native, converted)
         provenance = write_description(job, fitted.scene, shown, _identity(job, origin), plan)
@@ -182,11 +183,6 @@ def _check_hooks(request: ConvertRequest, target: Target) -> None:
     if request.to == "gaussians" and (own := sorted(hooks - usual)):
         sentence = f"--method {request.method} relies on its hook '{own[0]}', which converted Gaussians are refitted without."
         raise InputError(sentence, f"Convert to {target.method}, and start a fit from that: --set field.init=field.")
-
-
-def _check_empty(folder: RunFolder) -> None:
-    if folder.has(Provenance):
-        raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
 
 
 def _scores(model: Model, fitted: Fitted, title: str) -> Scores:

@@ -15,6 +15,7 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.build import build_model, configure_torch, open_with_progress, use_kernels
 from invgraphics.experiments.environment import code_version
 from invgraphics.experiments.evaluate import evaluate
+from invgraphics.experiments.identity import check_unused
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import write_description
@@ -25,9 +26,8 @@ from invgraphics.formats.ply import FILTERED, OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
-from invgraphics.runs.folder import RunFolder
 from invgraphics.runs.history import Moment
-from invgraphics.runs.provenance import ImportedFile, Provenance
+from invgraphics.runs.provenance import ImportedFile
 from invgraphics.text import sha256_of
 from invgraphics.tools.file_frames import WORLD, file_from_world, local_from_file
 
@@ -87,7 +87,7 @@ def import_run(request: ImportRequest) -> Path:
     job = replace(job, method=method_for(job.method, request.file, splats.gaussians))
     axes = request.frame or splats.axes
     folder = job.folder
-    _check_empty(folder)  # before the work, and again under the lock
+    check_unused(folder)  # before the work, and again under the lock
     scene = open_with_progress(job.request.scene, job.options)
     place = local_from_file(scene, axes, request.world)
     if request.transform is not None:
@@ -103,7 +103,7 @@ def import_run(request: ImportRequest) -> Path:
         what = f"The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true{also} shows it so."
         print(what, file=sys.stderr)
     with folder.held():
-        _check_empty(folder)
+        check_unused(folder)
         folder.clear()
         provenance = write_description(job, scene, scene, _identity(job.method, scene, origin))
         folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
@@ -130,11 +130,6 @@ def _warn_of_frame(gaussians: Gaussians, scene: Scene, splats: Splats, request: 
         why = f"{maker} writes files in a frame of its own" if maker else "it may be in a frame of its own"
         what = f"Warning: {share:.0%} of the Gaussians lie in a training picture; {why}."
         print(f"{what} --transform dataparser_transforms.json, or --frame, places it.", file=sys.stderr)
-
-
-def _check_empty(folder: RunFolder) -> None:
-    if folder.has(Provenance):
-        raise InputError(f"{folder.root} already holds a run.", "Choose another --out.")
 
 
 def without_zero_bands(gaussians: Gaussians) -> Gaussians:

@@ -28,7 +28,7 @@ SPIRAL_TURNS = 2
 """Turns of a spiral, in which it goes once forward and back."""
 
 WRAPPED = 8
-"""Keyframes of a loop repeated at either end: a spline forgets what is farther away."""
+"""Keyframes of a loop repeated at either end: the influence of farther ones on a spline has decayed."""
 
 PathName = Literal["orbit", "spiral", "interpolate"]
 

@@ -1,4 +1,4 @@
-"""What a fit's seconds were worth: scheduler times of this process, and the processor's speed.
+"""CPU share and processor speed during a fit: scheduler times of this process, and a speed probe.
 
 CPU time against time waiting for a core distinguishes a loaded machine from serial code, and a machine that stood still from
 both. Neither shows a core that does less in a second since its other hyperthread is busy, a neighbour on the same host fills

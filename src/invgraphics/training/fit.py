@@ -224,9 +224,12 @@ class Fit:
         self.resume_clocks(clocks)
 
     def clocks(self) -> dict[str, float | None]:
-        """Seconds of the steps (of all threads together: ``cpu_seconds``), those excluded because the process stood still,
-        those in which busy threads ran, and waited for a core, since the fit began (``None`` where the system reports none),
-        and the processor's speed meanwhile (`SpeedProbe`; ``None`` on other devices)."""
+        """Clock readings of the fit by name, as `resume_clocks` takes them.
+
+        ``seconds`` and ``cpu_seconds`` (of all threads) of the steps; ``standstill_seconds`` excluded because the process stood
+        still; ``ran_seconds`` and ``waited_seconds`` of busy threads since the fit began (``None`` where the system reports
+        none); ``processor_speed`` and ``speed_probes`` of the `SpeedProbe` (``None`` on other devices).
+        """
         here = self._scheduler.seconds()
         ran, waited = (None, None) if here is None else (self._earlier[0] + here[0], self._earlier[1] + here[1])
         return {

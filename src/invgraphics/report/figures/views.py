@@ -28,7 +28,7 @@ EVENLY_SPACED = 4
 SPLAT_DEPTH = "Of volumes and splats it is a mean over all that a pixel sees: at edges and in haze it lies between surfaces."
 SPLAT_NORMALS = "A splat's is its shortest axis, so that round or few splats look faceted or noisy where the picture is right."
 ERRORS = "Black is no error; thin bright lines are edges that are a fraction of a pixel off."
-"""What a reader of the maps may wonder about."""
+"""Notes below the depth, normal and error maps."""
 
 
 @dataclass(frozen=True)

@@ -216,7 +216,7 @@ def contrasts_of(
 
 
 def places_of(factor: Factor, each: str, among: Sequence[str]) -> list[dict[str, str]]:
-    """Where a factor is answered: at one level of ``each`` after the other, or once over everything."""
+    """Levels of ``each`` at which a factor's effect is estimated; one empty level for all of them together."""
     return [{each: level} for level in among] if each and factor.path != each else [{}]
 
 

@@ -37,7 +37,7 @@ def disturbed_words(count: int, quantity: MeasuredQuantity) -> str:
 
 
 def unscored_sentences(metric: str, shown: MeasuredQuantity | None) -> list[str]:
-    """That no fit has the score which a study asks about, and which one stands in for it; empty where one has."""
+    """Sentence naming the metric that replaces a study's missing one; empty if none is missing."""
     if shown is None or shown.key == metric:
         return []
     return [f"The study asks about {metric_label(metric)}, which no finished fit has: what follows is of {shown.label}."]

@@ -25,7 +25,7 @@ STRAIGHT = 0.25
 
 
 MAPS_BACK = 0.01
-"""A pixel is believed to have a ray where that ray leads back to within this many pixels of it."""
+"""Largest round-trip error, in pixels, of a pixel's ray: beyond it the undistortion has not converged, and there is none."""
 
 
 def write_scene(model: Any, photos: Sequence[Prepared], work: Path, result: Path, progress: Progress) -> float:

@@ -13,7 +13,7 @@ _HEAD = struct.Struct(">I4s")  # length of the data and type; then the data and 
 def cut_off(path: Path) -> str:
     """Find a chunk of a PNG file that claims more bytes than the file has; returns it in words, empty for none.
 
-    Reads the chunks' headers only. Pillow believes them, and reserves up to 4 GB for one.
+    Reads the chunks' headers only. Pillow allocates their sizes unchecked, up to 4 GB for one.
     """
     with path.open("rb") as file:
         start, size = len(SIGNATURE), path.stat().st_size
