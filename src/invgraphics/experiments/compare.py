@@ -200,7 +200,7 @@ def _refusal(request: CompareRequest, method: str, error: InputError) -> Refusal
         sentence = error.sentence if method in error.sentence else f"{method}: {error.sentence}"
         remedy = error.remedy
         if error.sentence.startswith("Unknown key") and len(request.methods) > 1:
-            remedy += f"\nA key of one method only is part of its name: --methods {method}:KEY=VALUE,OTHER."
+            remedy += "\nA key of one method only is part of its name: --methods METHOD:KEY=VALUE,OTHER."
         raise InputError(sentence, remedy) from error
     return Refusal(method=method, reason=error.sentence)
 

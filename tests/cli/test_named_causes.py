@@ -1,0 +1,68 @@
+"""Messages name what was mistaken for what, and the way out."""
+
+from pathlib import Path
+
+import pytest
+
+import invgraphics as ig
+from invgraphics.cli import main
+from invgraphics.scenes.open import DATA
+
+
+def _said(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert main.run(words) == main.BAD_INPUT
+    return capsys.readouterr().err
+
+
+def test_a_scene_in_the_place_of_a_method_and_the_reverse(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "'bricks' is a scene; the order is `fit METHOD SCENE`." in _said(["fit", "bricks", "volumetric/hash"], capsys)
+    with pytest.raises(ig.InputError, match="'volumetric/hash' is a method; the order is"):
+        ig.load_scene("volumetric/hash")
+
+
+def test_a_real_capture_by_part_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("nerf_synthetic_mic", "other"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv(DATA, str(tmp_path))
+    assert "Did you mean '$INVGRAPHICS_DATA/nerf_synthetic_mic'?" in _said(["fit", "volumetric/hash", "mic"], capsys)
+    said = _said(["fit", "volumetric/hash", "$INVGRAPHICS_DATA/mic"], capsys)
+    assert "mic is not in $INVGRAPHICS_DATA.\nIt holds nerf_synthetic_mic, other." in said
+    monkeypatch.delenv(DATA)
+    assert "Real captures: '$INVGRAPHICS_DATA/NAME'" in _said(["fit", "volumetric/hash", "mic"], capsys)
+    assert "Set the variable to the folder" in _said(["fit", "volumetric/hash", "$INVGRAPHICS_DATA/mic"], capsys)
+
+
+def test_a_parameter_group_that_the_recipe_lacks() -> None:
+    with pytest.raises(
+        ig.InputError, match=r"has no parameter group 'tabel'. Did you mean 'table'?.*\nIts groups: field, table"
+    ):
+        ig.load_method("volumetric/hash", set={"optimiser.groups.tabel.lr": 0.1})
+    new = {"optimiser.groups.first.lr": 0.1, "optimiser.groups.first.match": "field.geometry"}
+    assert "first" in ig.load_method("volumetric/hash", set=new).table["optimiser"]["groups"]
+
+
+def test_a_key_of_one_method_among_several(toy_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["compare", str(toy_folder), "--methods", "volumetric/hash,splatting/gaussians", "--set", "field.dropout=0.2"]
+    assert "--methods METHOD:KEY=VALUE,OTHER" in _said(words, capsys)
+
+
+def test_help_of_a_command_by_either_word(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    for words in (["help", "doctor"], ["doctor", "--help"]):
+        with pytest.raises(SystemExit):
+            main.run(words)
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1] and "usage: invgraphics doctor" in shown[0]
+
+
+def test_a_budget_that_is_spent_has_nothing_to_resume(toy_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    method = ig.load_method("splatting/gaussians", set={"field.count": 50})
+    fit = ig.fit(method, str(toy_folder), "5steps")
+    assert fit.steps == 5 and fit.seconds > 0
+    capsys.readouterr()
+    fit.resume("3steps")
+    assert "Nothing to resume: 5 steps" in capsys.readouterr().err
+    fit.resume("7steps")
+    assert fit.steps == 7 and "Nothing to resume" not in capsys.readouterr().err
