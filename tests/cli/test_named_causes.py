@@ -66,3 +66,12 @@ def test_a_budget_that_is_spent_has_nothing_to_resume(toy_folder: Path, capsys: 
     assert "Nothing to resume: 5 steps" in capsys.readouterr().err
     fit.resume("7steps")
     assert fit.steps == 7 and "Nothing to resume" not in capsys.readouterr().err
+
+
+def test_lists_of_a_kind_tell_what_its_members_mean(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.run(["list", "metrics", "scenes"]) == 0
+    text = capsys.readouterr().out
+    assert "structural similarity: Gaussian 11x11 window" in text
+    mugs = next(line for line in text.splitlines() if line.strip().startswith("mugs"))
+    assert "64x64" in mugs and "16, 8 of 144 objects" in mugs
+    assert "'bricks'. It is a scene: `invgraphics list scenes`." in _said(["list", "bricks"], capsys)

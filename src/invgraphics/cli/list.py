@@ -1,8 +1,13 @@
-"""``invgraphics list``: list methods, scenes and components with their origins, importing no implementation; or one method."""
+"""``invgraphics list``: list methods, scenes and components with their origins; or one method.
+
+Without a kind nothing is imported but the recipes; of a kind that is named, implementations are, for what they mean.
+"""
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
@@ -66,13 +71,13 @@ class List:
             elif kind == "methods":
                 _list_methods()
             elif kind == "scenes":
-                _list_scenes()
+                _list_scenes(in_full=bool(self.kinds))
             elif kind == "studies":
                 _list_studies()
             elif kind == "protocols":
                 _list_protocols()
             else:
-                _list_components(kind)
+                _list_components(kind, in_full=bool(self.kinds))
             if kind == "metrics":
                 _list_surface_metrics()
         return 0
@@ -90,6 +95,8 @@ def _method(name: str) -> Method:
     recipe = split_name(name)[0]
     if "/" not in recipe and not recipe.endswith(".toml") and recipe not in methods():
         guess = did_you_mean(name, KINDS) or suggested_method(recipe, methods())
+        if (find("scenes") / name / "scene.toml").is_file():
+            guess = " It is a scene: `invgraphics list scenes`."
         raise InputError(f"There is no list of '{name}'.{guess}", f"Lists: {', '.join(KINDS)}; or a method.")
     return load_method(name)
 
@@ -133,12 +140,25 @@ def _list_methods() -> None:
     show_table("Methods (field x renderer recipes)", columns, rows)
 
 
-def _list_scenes() -> None:
-    rows = []
+def _list_scenes(in_full: bool) -> None:
+    rows, columns = [], ("name", "what it shows", "stresses")
     for path in sorted(find("scenes").glob("*/scene.toml")):
         table = read_toml(path)
-        rows.append((path.parent.name, str(table.get("summary", "")), str(table.get("stresses", ""))))
-    show_table("Scenes (rendered by Mitsuba; a path to a data set serves as well)", ("name", "what it shows", "stresses"), rows)
+        rows.append((path.parent.name, str(table.get("summary", "")), str(table.get("stresses", "")), *_size(path, in_full)))
+    columns += ("size", "views (train, test)", "samples per pixel") if in_full else ()
+    show_table("Scenes (rendered by Mitsuba; a path to a data set serves as well)", columns, rows)
+
+
+def _size(path: Path, in_full: bool) -> tuple[str, ...]:
+    """A scene's default size, numbers of views and samples per training pixel, as texts; nothing unless ``in_full``."""
+    if not in_full:
+        return ()
+    from invgraphics.scenes.mitsuba.spec import read
+
+    spec = read(path)
+    each = f" of {spec.instances.total} objects" if spec.instances else ""
+    views = f"{spec.views.train}, {spec.views.test}{each}"
+    return f"{spec.size[0]}x{spec.size[1]}", views, str(spec.samples.train)
 
 
 def _list_studies() -> None:
@@ -165,8 +185,22 @@ def _list_surface_metrics() -> None:
     show_table("Geometry scores of distances and meshes", ("name", "unit", "definition"), rows)
 
 
-def _list_components(kind: str) -> None:
+def _list_components(kind: str, in_full: bool) -> None:
     registry = COMPONENTS[kind]
-    rows = [(name, plugins.origin(registry, name), target) for name, target in plugins.names(registry).items()]
+    rows = [
+        (name, *([_meaning(registry, name)] if in_full else []), plugins.origin(registry, name), target)
+        for name, target in plugins.names(registry).items()
+    ]
     title = TITLES.get(kind, kind.capitalize())
-    show_table(title, ("name", "from", "implementation"), rows)
+    show_table(title, ("name", *(["meaning"] if in_full else []), "from", "implementation"), rows)
+
+
+def _meaning(registry: str, name: str) -> str:
+    """A component's summary, or the first paragraph of its docstring; empty where it cannot be imported, or says nothing."""
+    try:
+        part = plugins.load(registry, name)
+    except InputError:
+        return ""
+    if summary := getattr(part, "summary", ""):
+        return f"{summary} ({part.unit})" if getattr(part, "unit", "") else str(summary)
+    return " ".join((inspect.getdoc(part) or "").partition("\n\n")[0].split())
