@@ -159,3 +159,9 @@ def test_names_are_gathered_where_they_are_told() -> None:
     words = redactor_for([{"a": ["/home/zoe/x"], "HOST": "turing.lab"}, "/Users/kim/y"]).words
     assert {"zoe", "kim", "turing.lab", LOGIN, NODE} <= set(words)
     assert "root" not in words
+
+
+def test_scenes_whose_paths_end_alike_stay_apart() -> None:
+    redactor = redactor_for([], ["/a/fox", "/b/fox", "/a/fox", "bricks", "/c/owl"])
+    shown = ["/a/fox", "/b/fox", "bricks", "/c/owl", "fit of '/b/fox' at 60s", "/b/fox/0.png"]
+    assert redactor.value(shown) == ["fox", "fox (2)", "bricks", "owl", "fit of 'fox (2)' at 60s", "0.png"]

@@ -54,7 +54,7 @@ def build_study_report(folder: Path, out: Path | None = None, public: bool = Fal
     redactor = None
     if public:
         check_runs_outside(target, [folder])
-        redactor = redactor_for([study])
+        redactor = redactor_for([study], study.scenes)
         study = redactor.value(study)
     place = Folder(target, redactor=redactor)
     with writing(target):

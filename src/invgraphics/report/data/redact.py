@@ -7,8 +7,9 @@ import getpass
 import json
 import re
 import socket
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
 
@@ -58,10 +59,12 @@ class Redactor:
     Attributes:
         words: user and host names, matched as whole words whatever their case.
         paths: absolute paths that some record holds as a whole; elsewhere their spaces would hide where they end.
+        names: path -> what replaces it, where the last component would not tell it from another.
     """
 
     words: tuple[str, ...]
     paths: tuple[str, ...] = ()
+    names: Mapping[str, str] = field(default_factory=dict)
 
     def text(self, text: str) -> str:
         """Redact a text: absolute paths become their last component, private words an ellipsis."""
@@ -101,7 +104,9 @@ class Redactor:
             write_text(target, self.text(read_text(source, LIMITS.json_bytes)))
 
     def _last(self, path: str) -> str:
-        """The last component of an absolute path, unless it is a home or a private word."""
+        """The last component of an absolute path, unless it is a home or a private word, or has a name of its own."""
+        if path in self.names:
+            return self.names[path]
         windows = "\\" in path
         parts = list(PureWindowsPath(path).parts if windows else [part for part in path.split("/") if part])
         last = parts[-1] if parts else ""
@@ -114,17 +119,35 @@ class Redactor:
         return {word.lower() for word in self.words}
 
 
-def redactor_for(records: Iterable[Any]) -> Redactor:
-    """Redactor of this machine's user and host, and of names from home folders and private keys in ``records``."""
+def redactor_for(records: Iterable[Any], scenes: Sequence[str] = ()) -> Redactor:
+    """Redactor of this machine's user and host, and of names from home folders and private keys in ``records``.
+
+    Args:
+        records: what the report is made of.
+        scenes: of the report; different ones whose paths end alike are numbered, since tables and statistics go by them.
+    """
     found = {socket.gethostname(), socket.gethostname().partition(".")[0], Path.home().name}
     with contextlib.suppress(KeyError, OSError):  # some containers' users have no name
         found.add(getpass.getuser())
     for record in records:
         _gather(record, found)
     names = {name for name in found if len(name) >= SHORTEST and name.lower() not in GENERIC_NAMES}
-    paths = {name for name in found if _is_path(name)}
-    longest = [tuple(sorted(group, key=lambda name: (-len(name), name))) for group in (names - paths, paths)]
-    return Redactor(*longest)
+    whole = {name for name in found if _is_path(name)}
+    words, paths = (tuple(sorted(group, key=lambda name: (-len(name), name))) for group in (names - whole, whole))
+    redactor = Redactor(words, paths)
+    return replace(redactor, names=_numbered(scenes, redactor))
+
+
+def _numbered(scenes: Sequence[str], redactor: Redactor) -> dict[str, str]:
+    """Numbered names of the scenes after the first whose redacted names are equal."""
+    names: dict[str, str] = {}
+    seen: Counter[str] = Counter()
+    for scene in dict.fromkeys(scenes):
+        name = redactor.text(scene)
+        seen[name] += 1
+        if seen[name] > 1:
+            names[scene] = f"{name} ({seen[name]})"
+    return names
 
 
 def _is_path(text: str) -> bool:
