@@ -71,7 +71,8 @@ def _hints(schema: type) -> dict[str, Any]:
 def fill_slot(registry: str, table: Mapping[str, Any], path: str) -> Any:
     """Fill the registered config that ``table['type']`` names from the rest of the table."""
     if not isinstance(table, Mapping) or "type" not in table:
-        raise InputError(f"'{path}' needs a 'type' key.", f"Known {registry}: {', '.join(sorted(plugins.names(registry)))}.")
+        known = ", ".join(sorted(plugins.names(registry)))
+        raise InputError(f"'{path}' needs a 'type' key.", f"{path}.type names one of the {registry}: {known}.")
     rest = {key: value for key, value in table.items() if key != "type"}
     schema = plugins.load(registry, str(table["type"]))
     if not (isinstance(schema, type) and dataclasses.is_dataclass(schema)):

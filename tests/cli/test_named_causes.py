@@ -75,3 +75,36 @@ def test_lists_of_a_kind_tell_what_its_members_mean(capsys: pytest.CaptureFixtur
     mugs = next(line for line in text.splitlines() if line.strip().startswith("mugs"))
     assert "64x64" in mugs and "16, 8 of 144 objects" in mugs
     assert "'bricks'. It is a scene: `invgraphics list scenes`." in _said(["list", "bricks"], capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["fit", "splatting/gaussians", "bricks", "--max-primitives", "abc"],
+            "parsing --max-primitives: 'abc' is not a whole number",
+        ),
+        (["fit", "splatting/gaussians", "bricks", "--seed", "x"], "parsing --seed: 'x' is not a whole number"),
+        (
+            ["compare", "bricks", "--methods", "volumetric/hash", "splatting/gaussians"],
+            "have commas between them: --methods A,B.",
+        ),
+        (
+            ["fit", "volumetric/hash", "bricks", "--set", "renderer.sampler=even"],
+            "renderer.sampler.type names one of the samplers: ",
+        ),
+    ],
+)
+def test_values_that_cannot_be_read(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = _said(words, capsys)
+    assert sentence in said and "NoneType" not in said
+
+
+def test_a_view_in_the_place_of_its_camera(scene: ig.Scene) -> None:
+    model = ig.Model(
+        ig.testing.TwoBalls(),
+        ig.renderers.volumetric.VolumetricConfig(ig.renderers.samplers.StratifiedConfig(8)).build(scene),
+        scene.bounds,
+    )
+    with pytest.raises(ig.InputError, match=r"A View is no camera.\nThat of a view is view.camera."):
+        model.render(scene.test[0])  # pyright: ignore[reportArgumentType]

@@ -163,13 +163,24 @@ def condense(box: str) -> tuple[str, str]:
     """Condense tyro's framed error message to a sentence (one or two lines) and a remedy."""
     lines = [line.strip(_BOX + " ") for line in box.splitlines()]
     # Inside the frame, horizontal rules part the message from suggestions, the argument's help and the pointer to --help.
-    parts = [" ".join(part.split()) for part in re.split(r"─{4,}", "\n".join(lines[1:]))]
+    parts = [" ".join(part.split()) for part in re.split(r"[─-]{4,}", "\n".join(lines[1:]))]
     parts = [part for part in parts if part and not part.startswith(("Argument helptext", "Available subcommands"))]
     if not parts:
         return "The arguments cannot be read.", ""
     sentence = re.sub(r"invalid literal for int\(\) with base 10: ('.*')", r"\1 is not a whole number", parts[0])
+    sentence = re.sub(
+        r"no type matching .* could be instantiated from \['(.*?)'\]\. Got errors: .*<class '(\w+)'>.*", _misfit, sentence
+    )
     hints = [part for part in parts[1:-1] if part.startswith("Perhaps")]
+    if re.fullmatch(r"Unrecognized options: [^-]\S*/.*", sentence):
+        hints = ["Names of several methods have commas between them: --methods A,B."]
     return "\n".join([sentence, *hints[:1]]), parts[-1] if len(parts) > 1 else ""
+
+
+def _misfit(found: re.Match[str]) -> str:
+    """A value of a wrong type, in words; of tyro's list of types that may be left out, the last is the type proper."""
+    kinds = {"int": "whole number", "float": "number"}
+    return f"'{found[1]}' is not a {kinds.get(found[2], found[2])}"
 
 
 def refuse_idle(given: Mapping[str, Any], why: str, remedy: str = "") -> None:

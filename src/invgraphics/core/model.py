@@ -17,6 +17,7 @@ from invgraphics.core.field import Field, Gaussians, Quantity
 from invgraphics.core.finite import describe_non_finite
 from invgraphics.core.renderer import Renderer, check
 from invgraphics.core.rendering import Context, Rendering
+from invgraphics.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +78,10 @@ class Model:
         """The camera on the model's device, in its precision.
 
         Raises:
-            InputError: it has no size, or a pose that is not rigid.
+            InputError: it is no camera, has no size, or a pose that is not rigid.
         """
+        if not isinstance(camera, Camera):
+            raise InputError(f"A {type(camera).__name__} is no camera.", "That of a view is view.camera.")
         check_pose(camera, "the camera")
         return camera.to(self.device).to(self.bounds.lo.dtype)
 

@@ -114,7 +114,8 @@ class TrainingData:
         """
         if self.train_views is not None and self.train_views > len(scene.train):
             raise InputError(
-                f"data.train_views = {self.train_views}, but '{scene.name}' has {len(scene.train)} training views."
+                f"data.train_views = {self.train_views}, but '{scene.name}' has {len(scene.train)} training views.",
+                "Give as many at most, or leave it out for all.",
             )
         largest = max(max(view.camera.width, view.camera.height) for view in scene.train)
         if self.size is not None and self.size > largest:
