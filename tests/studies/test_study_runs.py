@@ -18,7 +18,7 @@ from invgraphics.experiments.run import fit_run
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.studies import ablate as module
 from invgraphics.studies.ablate import ablate
-from invgraphics.studies.forecast import START_SECONDS, Cost, Forecast, total, try_method
+from invgraphics.studies.forecast import START_SECONDS, Cost, Forecast, limited_threads, total, try_method
 from invgraphics.training.budget import Budget
 
 METHOD = "splatting/gaussians"
@@ -238,6 +238,25 @@ def test_the_forecast_adds_up() -> None:
     assert forecast.seconds == (3600 + 10 + 50 + 10 + 60 + 5) / 2
     assert (forecast.runs, forecast.missing, forecast.size) == (7, 3, 9 * 10**9)
     assert str(forecast) == "7 runs, 4 of them finished; the rest takes about 31 min 8 s and 9 GB."
+    shown = total([(slow, None)], runs=7, jobs=1, later=2)  # fitted, and to be shown by another renderer
+    assert str(shown) == "7 runs, 4 of them finished, 2 left out; the rest takes about 10 s and 4 GB."
+
+
+def test_what_a_command_leaves_out_is_counted_as_such(executor, request_of) -> None:
+    forecasts = []
+    ablate(request_of(cells="* seed=0"), forecasts.append)
+    assert (forecasts[0].runs, forecasts[0].missing, forecasts[0].later) == (4, 2, 2)
+    ablate(request_of(), forecasts.append)
+    assert (forecasts[1].runs, forecasts[1].missing, forecasts[1].later) == (4, 2, 0)
+
+
+def test_costs_are_measured_with_a_run_s_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    counts: list[int] = []
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(torch, "set_num_threads", counts.append)
+    with limited_threads(3):
+        assert counts == [3]
+    assert counts == [3, 8]
 
 
 def test_training_data_has_the_same_door_in_fit_and_compare(toy_folder: Path, tmp_path: Path) -> None:
