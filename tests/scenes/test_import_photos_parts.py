@@ -18,7 +18,7 @@ from PIL import Image
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.photos import PhotoJob, job
-from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
+from invgraphics.scenes.photos.maker import JOB, RESULT, WORK, reconstruct, result_folder
 from invgraphics.scenes.photos.prepare import Preparation, prepare
 from invgraphics.scenes.photos.result import _move_points, max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
@@ -541,3 +541,32 @@ def test_an_interrupted_import_is_gone_on_with(tmp_path: Path, monkeypatch) -> N
             reconstruct(request, out)
     assert [first == second for first, second in pairwise(started)] == [True, False]
     assert left == [False, True, True]
+
+
+def test_a_refused_result_replaces_no_usable_one(tmp_path: Path, monkeypatch) -> None:
+    """It lies beside it and answers its own request; the next usable result replaces both."""
+    save(noise(0, 64, 64), tmp_path / "photos/0.png")
+    out, calls = tmp_path / "out", []
+
+    def work(module: str, folder: Path, *args, **kwargs) -> None:
+        asked = json.loads((folder / JOB).read_text())
+        seed = asked["job"]["seed"]
+        calls.append(seed)
+        (folder / RESULT / "images").mkdir(parents=True)
+        (folder / RESULT / "images" / f"{seed}.png").write_text("")
+        report = {"key": asked["key"], "job": asked["job"], "usable": seed % 2 == 0}
+        (folder / RESULT / "quality.json").write_text(json.dumps(report))
+
+    monkeypatch.setattr("invgraphics.scenes.photos.maker.run_worker", work)
+
+    def left(seed: int) -> tuple[bool, Path, list[str]]:
+        quality = reconstruct(PhotoJob(str(tmp_path / "photos"), seed=seed), out)
+        files = sorted(str(path.relative_to(out)) for path in out.glob("**/images/*"))
+        return quality["usable"], result_folder(out, quality), files
+
+    assert left(1) == (False, out, ["images/1.png"])
+    assert left(0) == (True, out, ["images/0.png"])
+    assert left(3) == left(3) == (False, out / "refused", ["images/0.png", "refused/images/3.png"])
+    assert left(0) == (True, out, ["images/0.png", "refused/images/3.png"])
+    assert calls == [1, 0, 3]
+    assert left(2) == (True, out, ["images/2.png"])

@@ -18,7 +18,7 @@ from invgraphics.metrics.poses import pose_errors
 from invgraphics.scenes.open import SceneOptions, find_loader
 from invgraphics.scenes.photos import PhotoJob, reconstruct
 from invgraphics.scenes.photos.job import QUALITY
-from invgraphics.scenes.photos.maker import writing
+from invgraphics.scenes.photos.maker import result_folder, writing
 from invgraphics.scenes.process import Progress
 
 _LEAST = 3  # cameras: with two, a similarity explains everything
@@ -36,7 +36,7 @@ def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress:
         progress: called with (done, in all, what is being done).
 
     Returns:
-        The content of ``out``/quality.json, with ``truth`` if poses could be compared.
+        The content of quality.json in `invgraphics.scenes.photos.maker.result_folder`, with ``truth`` if poses could be compared.
 
     Raises:
         InputError: see `invgraphics.scenes.photos.reconstruct`; or ``truth`` does not know these photographs.
@@ -50,7 +50,7 @@ def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress:
             quality["truth"] = compare(job.path, quality, truth)
         else:
             quality |= _found_truth(job.path, quality)
-        write_text(out / QUALITY, json.dumps(quality, indent=1))
+        write_text(result_folder(out, quality) / QUALITY, json.dumps(quality, indent=1))
     return quality
 
 
