@@ -36,7 +36,7 @@ def import_photos(job: PhotoJob, out: Path, truth: Path | None = None, progress:
         progress: called with (done, in all, what is being done).
 
     Returns:
-        The content of quality.json in `invgraphics.scenes.photos.maker.result_folder`, with ``truth`` if poses could be compared.
+        The content of the scene's quality.json, with ``truth`` if poses could be compared.
 
     Raises:
         InputError: see `invgraphics.scenes.photos.reconstruct`; or ``truth`` does not know these photographs.

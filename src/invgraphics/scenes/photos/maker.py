@@ -42,8 +42,8 @@ def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> d
         progress: called with (done, in all, what is being done).
 
     Returns:
-        The content of quality.json in `result_folder`, ``out`` as a rule. Its ``usable`` is false where too few photographs could
-        be placed, with the reason in ``refusal``; what could be placed is kept all the same, but replaces no usable result.
+        The content of quality.json in `result_folder`, ``out`` as a rule. Its ``usable`` is false where too few photographs
+        could be placed, with the reason in ``refusal``; what could be placed is kept, but replaces no usable result.
 
     Raises:
         InputError: there are no photographs, the folder holds something else or cannot be written, or the work failed.

@@ -95,7 +95,8 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         top_view(best.pieces[0], title, result / TOP_VIEW)
         bend = write_scene(best.pieces[0], photos, matched.work, result, clock.show)
     clock.start("")
-    refused, placed = refusal(photos, matched.evidence, figures["registered"]), {one["name"] for one in figures["cameras"]}
+    refused = refusal(photos, matched.evidence, [camera["points"] for camera in figures["cameras"]])
+    placed = {camera["name"] for camera in figures["cameras"]}
     return {
         "job": parse_json(job.text(), "the job"),
         "given": len(photos) + len(skipped),
