@@ -56,6 +56,7 @@ def test_copies_are_upright_reduced_and_grouped(tmp_path: Path) -> None:
     preparation = prepared(folder, tmp_path, max_size=100)
     assert [photo.name for photo in preparation.photos] == ["IMG_9.png", "IMG_10.png", "IMG_11.png", "IMG_12.png"]
     assert [(photo.width, photo.height) for photo in preparation.photos] == [(100, 50)] * 3 + [(50, 100)]
+    assert [photo.orientation for photo in preparation.photos] == [1, 1, 1, 8]
     assert len({photo.group for photo in preparation.photos}) == 2
     small = np.array(Image.open(tmp_path / "work/photos/IMG_12.png"))
     averaged = np.rot90(turned).reshape(100, 2, 50, 2, 3).mean(axis=(1, 3))

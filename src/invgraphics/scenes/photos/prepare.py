@@ -44,6 +44,7 @@ class Prepared:
         centre: principal point, where the data set states it.
         masked: whether no features are looked for in parts of it: where it is transparent, or has a mask.
         own_mask: whether it has a mask, beside the photographs or of a data set, which the scene keeps.
+        orientation: EXIF orientation of the photograph, by which the working copy is turned upright.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Prepared:
     centre: tuple[float, float] | None = None
     masked: bool = False
     own_mask: bool = False
+    orientation: int = 1
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ def _write(
         camera = source.camera.resized(width, height)
         focal = float(camera.focal.mean())
         centre = (float(camera.principal_point[0]), float(camera.principal_point[1]))
-    return Prepared(name, source.name, width, height, group, focal, centre, masked, mask is not None)
+    return Prepared(name, source.name, width, height, group, focal, centre, masked, mask is not None, source.orientation)
 
 
 def _mask(source: Source, whole: UInt8[np.ndarray, "h w c"], pixels: np.ndarray) -> Bool[np.ndarray, "height width"] | None:

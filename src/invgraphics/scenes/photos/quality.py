@@ -23,7 +23,10 @@ NO_MOTION = 0.01
 
 
 def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:
-    """Figures of a reconstruction (before its lens is removed): counts, errors in pixels, cameras and lenses."""
+    """Figures of a reconstruction (before its lens is removed): counts, errors in pixels, cameras and lenses.
+
+    Cameras are those of the upright working copies, with their size and the EXIF orientation by which they were turned.
+    """
     placed = {image.name: image for image in model.images.values() if image.has_pose}
     cameras = []
     for photo in photos:
@@ -32,7 +35,7 @@ def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:
             pose = np.eye(4)
             pose[:3] = image.cam_from_world().inverse().matrix()
             entry = {"name": photo.name, "source": photo.source, "points": image.num_points3D, "cam_to_world": pose.tolist()}
-            cameras.append(entry)
+            cameras.append(entry | {"size": [photo.width, photo.height], "orientation": photo.orientation})
     return {
         "registered": len(cameras),
         "points": model.num_points3D(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -178,8 +178,12 @@ def _open(path: Path) -> Any:
 
 
 def _orientation(image: Any) -> int:
+    return exif_orientation(image.getexif())
+
+
+def exif_orientation(exif: Mapping[int, Any]) -> int:
     """EXIF orientation, 1 to 8; 1, as it is stored, where there is none or what is there is no such number."""
-    found = image.getexif().get(_ORIENTATION, 1)
+    found = exif.get(_ORIENTATION, 1)
     return found if found in _UPRIGHT else 1
 
 
