@@ -124,12 +124,22 @@ def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:
     try:
         shutil.rmtree(folder, ignore_errors=True)  # a broken one, see `cache.read_truth`
         partial.mkdir(exist_ok=True)
+        _remove_unfinished(partial)
         write_text(request, json.dumps(job.table()))
         _run(job, partial, progress, lock)
         request.unlink()
         partial.replace(folder)
     except OSError as error:
         raise cache.unwritable(partial, error) from error
+
+
+def _remove_unfinished(partial: Path) -> None:
+    """Remove files that a killed process was writing: ``truth.json`` would list its own among the scene's.
+
+    Not left out where ``truth.json`` is written: that module's source is part of the keys of all renderings.
+    """
+    for path in partial.rglob("*.tmp"):
+        path.unlink()
 
 
 def _run(job: Job, partial: Path, progress: Progress, lock: int) -> None:
