@@ -67,7 +67,7 @@ def test_copies_are_upright_reduced_and_grouped(tmp_path: Path) -> None:
 
 def test_transparent_parts_are_masked_and_kept(tmp_path: Path) -> None:
     folder = tmp_path / "photos"
-    for index in range(2):
+    for index in range(3):
         picture = noise(index, 64, 64, 4)
         picture[..., 3] = np.where(np.arange(64) < 20, 0, 255)
         save(picture, folder / f"{index}.png")
@@ -181,12 +181,12 @@ def test_folders_without_photographs(content: dict[str, bytes], expected: str, t
 
 
 def test_photographs_in_folders_below_are_told_of(tmp_path: Path) -> None:
-    for seed, name in enumerate(("a.png", "b.png", "second camera/c.png")):
+    for seed, name in enumerate(("a.png", "b.png", "c.png", "second camera/d.png")):
         save(noise(seed, 64, 64), tmp_path / "photos" / name)
     save(np.full((64, 64), 255, np.uint8), tmp_path / "photos/masks/a.png.png")
     (tmp_path / "photos/notes").mkdir()
     found = prepared(tmp_path / "photos", tmp_path)
-    assert [photo.source for photo in found.photos] == ["a.png", "b.png"]
+    assert [photo.source for photo in found.photos] == ["a.png", "b.png", "c.png"]
     assert found.skipped == {"second camera/": "a folder with photographs of its own; put all of them into one"}
 
 
@@ -218,9 +218,18 @@ def test_a_decoder_that_is_installed_later_makes_another_import(tmp_path: Path, 
 
 def test_one_camera_cannot_have_two_sizes(tmp_path: Path) -> None:
     save(noise(0, 64, 48), tmp_path / "photos/a.png")
-    save(noise(1, 48, 64), tmp_path / "photos/b.png")
+    for index in (1, 2):
+        save(noise(index, 48, 64), tmp_path / f"photos/{index}.png")
     with pytest.raises(InputError, match="48x64, 64x48"):
         prepared(tmp_path / "photos", tmp_path, cameras="single")
+
+
+def test_two_photographs_are_refused_before_any_feature_is_sought(tmp_path: Path) -> None:
+    for index in range(2):
+        save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
+    with pytest.raises(InputError, match=r"only two photographs \(0\.png, 1\.png\)") as refused:
+        prepared(tmp_path / "photos", tmp_path)
+    assert "at least 3" in str(refused.value)
 
 
 def test_numbers_in_names_count_as_numbers() -> None:
@@ -288,7 +297,7 @@ def test_masks_beside_photographs_are_used(place: str, tmp_path: Path) -> None:
 
 
 def test_a_mask_that_cannot_be_used_leaves_its_photograph_out(tmp_path: Path) -> None:
-    for index in range(5):
+    for index in range(6):
         save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
     save(np.zeros((64, 64), np.uint8), tmp_path / "masks/0.png")
     save(np.full((64, 32), 255, np.uint8), tmp_path / "masks/1.png")
@@ -314,7 +323,7 @@ def test_masks_are_straightened_with_their_pictures(tmp_path: Path) -> None:
     params = [150.0, 80.0, 60.0, -0.2]
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=120, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(camera)
-    for number in (1, 2):
+    for number in (1, 2, 3):
         changed = picture.copy()
         changed[-1, -number] = 7  # no two may be the same
         save(np.repeat(changed[..., None], 3, axis=2), tmp_path / f"photos/{number}.png")
@@ -323,7 +332,7 @@ def test_masks_are_straightened_with_their_pictures(tmp_path: Path) -> None:
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), [number, 0, 0]])))
     photos = prepared(tmp_path / "photos", tmp_path).photos
     assert write_scene(model, photos, tmp_path / "work", tmp_path / "result", quiet) > 3
-    for number in (1, 2):
+    for number in (1, 2, 3):
         dark = np.array(Image.open(tmp_path / f"result/images/{number}.png"))[:100, :100, 0] < 250
         left_out = np.array(Image.open(tmp_path / f"result/masks/{number}.png.png"))[:100, :100] == 0
         assert dark.sum() > 300 and (left_out | ~dark).all()

@@ -27,6 +27,9 @@ PHOTOS, MASKS, OWN_MASKS, PREPARED = "photos", "masks", "own-masks", "prepared.j
 
 ADVICE = "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
 
+LEAST = 3
+"""Fewest photographs of a scene: no strategy keeps a reconstruction of fewer."""
+
 _OPAQUE = 128
 
 
@@ -82,7 +85,7 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     """Write the working copies into ``work``.
 
     Raises:
-        InputError: there are fewer than two different photographs that can be read.
+        InputError: there are fewer than `LEAST` different photographs that can be read.
     """
     (work / PHOTOS).mkdir(exist_ok=True)
     (work / MASKS).mkdir(exist_ok=True)
@@ -191,7 +194,7 @@ def _reason(name: str, error: InputError) -> str:
 
 def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> None:
     """Refuse photographs that no reconstruction is possible from."""
-    if len(photos) < 2:
+    if len(photos) < LEAST:
         _refuse(job.path, photos, skipped)
     sizes = {(photo.width, photo.height) for photo in photos}
     if job.cameras == "single" and len(sizes) > 1:
@@ -200,13 +203,15 @@ def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> No
 
 
 def _refuse(folder: Path, photos: list[Prepared], skipped: dict[str, str]) -> NoReturn:
-    what = f"only one photograph ({photos[0].source})" if photos else "no photograph"
+    names = ", ".join(photo.source for photo in photos)
+    what = ("no photograph", f"only one photograph ({names})", f"only two photographs ({names})")[len(photos)]
+    advice = f"A scene needs at least {LEAST}. {ADVICE}"
     if skipped:
         name, why = next(iter(skipped.items()))
         more = f" ({len(skipped)} files are left out)" if len(skipped) > 1 else ""
-        raise InputError(f"{folder} has {what} that can be used; {name}: {why}{more}.", ADVICE)
+        raise InputError(f"{folder} has {what} that can be used; {name}: {why}{more}.", advice)
     below = [str(path) for path in sorted(folder.iterdir()) if has_photographs(path)]
-    remedy = f"There are photographs in {below[0]}: name that folder." if below else ADVICE
+    remedy = f"There are photographs in {below[0]}: name that folder." if below else advice
     if len(below) > 1:
         remedy = f"There are photographs in {', '.join(below)}: name one of these folders, or put all photographs into one."
     raise InputError(f"{folder} has {what}.", remedy)

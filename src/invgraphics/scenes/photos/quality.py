@@ -10,10 +10,10 @@ import numpy as np
 from invgraphics.scenes.photos.outlier_cameras import FEW_POINTS
 from invgraphics.scenes.photos.pairs import VerifiedMatches
 from invgraphics.scenes.photos.panorama import is_panorama, widest_pairs
-from invgraphics.scenes.photos.prepare import ADVICE, Prepared
+from invgraphics.scenes.photos.prepare import ADVICE, LEAST, Prepared
 
-LEAST, SHARE = 3, 0.5
-"""A scene is usable when at least so many photographs, and this share of them, could be placed."""
+SHARE = 0.5
+"""A scene is usable when at least `LEAST` photographs, and this share of them, could be placed."""
 
 FEW_FEATURES = 200
 """A sharp photograph of a textured scene has thousands of SIFT features; below this one there is little to hold on to."""
