@@ -57,7 +57,8 @@ def mesh_scores(mesh: Mesh, scene: Scene) -> Scored:
     if scene.scan is not None:
         return _dtu_scores(mesh, scene, scene.scan)
     assert scene.mesh is not None
-    threshold = F_SCORE_SHARE * float((scene.bounds.hi - scene.bounds.lo).max())
+    box = scene.data_bounds or scene.bounds  # a run's own box would give each run another threshold
+    threshold = F_SCORE_SHARE * float((box.hi - box.lo).max())
     try:
         found = compare_surfaces(mesh, scene.mesh, threshold, [view.camera for view in scene.train], POINTS)
     except ValueError as error:

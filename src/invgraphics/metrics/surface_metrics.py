@@ -27,7 +27,10 @@ SURFACE_METRICS = {
             "surface_completeness", "world units", False, f"mean distance to the predicted surface of true points {_VISIBLE}"
         ),
         SurfaceMetric(
-            "f_score", "", True, "harmonic mean of the shares of these points within 1% of the longest edge of the scene's box"
+            "f_score",
+            "",
+            True,
+            "harmonic mean of the shares of these points within 1% of the data set's box",
         ),
         SurfaceMetric(
             "normal_consistency", "", True, "mean |cosine| between the normals of these points and of the nearest ones"

@@ -17,7 +17,7 @@ from invgraphics.core.mesh import face_normals
 POINTS = 100_000
 """Points on either surface that are compared."""
 F_SCORE_SHARE = 0.01
-"""Threshold of the F-score, over the longest edge of the scene's box (Tatarchenko et al. 2019, §5.1)."""
+"""Threshold of the F-score, over the longest edge of the data set's box (Tatarchenko et al. 2019, §5.1)."""
 CANDIDATES = 8
 """Nearest samples of a surface whose triangles a distance to it is computed from."""
 VIEW_PIXELS = 256
