@@ -381,11 +381,17 @@ def test_a_scene_repeats_the_inconsistency_of_its_import(key: str, suspicious: b
     (tmp_path / "sparse/0").mkdir(parents=True)
     model.write(str(tmp_path / "sparse/0"))
     assert "poses" not in open_scene(str(tmp_path), SceneOptions()).notes
-    quality = {"key": "k", "choice": "global mapper", key: {"suspicious": suspicious, "sentence": "3 of 9 contradict"}}
+    profile = "of 9 photographs converted to sRGB: 9 from Display P3"
+    quality = {
+        "key": "k",
+        "choice": "global mapper",
+        "colour_profile": profile,
+        key: {"suspicious": suspicious, "sentence": "3 of 9 contradict"},
+    }
     (tmp_path / "quality.json").write_text(json.dumps(quality))
     for spelled in (".", "sparse", "sparse/0", "images"):  # any of the scene's folders names it
         notes = open_scene(str(tmp_path / spelled), SceneOptions()).notes
-        assert notes.get("poses") == "global mapper", spelled
+        assert (notes.get("poses"), notes.get("colour_profile")) == ("global mapper", profile), spelled
         assert notes.get("inconsistent_poses") == ("3 of 9 contradict" if suspicious else None)
 
 

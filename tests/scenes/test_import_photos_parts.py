@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dots import save
+from icc import P3_D50, matrix_profile
 from PIL import Image
 
 from invgraphics.errors import InputError
@@ -63,6 +64,20 @@ def test_copies_are_upright_reduced_and_grouped(tmp_path: Path) -> None:
     assert np.abs(small - averaged).max() <= 0.51
     separate = prepared(folder, tmp_path, cameras="per-photo")
     assert len({photo.group for photo in separate.photos}) == 4
+
+
+def test_working_copies_are_srgb_and_name_the_profile_they_had(tmp_path: Path) -> None:
+    picture = np.full((64, 64, 3), (200, 60, 60), np.uint8)
+    for index in range(3):
+        picture[0, 0] = index
+        profile = matrix_profile(P3_D50) if index else None
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        Image.fromarray(picture).save(tmp_path / f"photos/{index}.png", icc_profile=profile)
+    found = prepared(tmp_path / "photos", tmp_path).photos
+    assert [photo.profile for photo in found] == ["", "wide", "wide"]
+    copies = [np.array(Image.open(tmp_path / f"work/photos/{index}.png"))[9, 9].tolist() for index in range(3)]
+    assert copies[0] == [200, 60, 60] and copies[1] == copies[2] and copies[1][0] > 210
+    assert "icc_profile" not in Image.open(tmp_path / "work/photos/1.png").info
 
 
 def test_transparent_parts_are_masked_and_kept(tmp_path: Path) -> None:

@@ -48,6 +48,7 @@ class Prepared:
         masked: whether no features are looked for in parts of it: where it is transparent, or has a mask.
         own_mask: whether it has a mask, beside the photographs or of a data set, which the scene keeps.
         orientation: EXIF orientation of the photograph, by which the working copy is turned upright.
+        profile: name of the colour profile from which the working copy is converted to sRGB; empty where it is not.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Prepared:
     masked: bool = False
     own_mask: bool = False
     orientation: int = 1
+    profile: str = ""
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,9 @@ def _write(
         camera = source.camera.resized(width, height)
         focal = float(camera.focal.mean())
         centre = (float(camera.principal_point[0]), float(camera.principal_point[1]))
-    return Prepared(name, source.name, width, height, group, focal, centre, masked, mask is not None, source.orientation)
+    profile = "" if source.profile is None else readable(source.profile())
+    own_mask = mask is not None
+    return Prepared(name, source.name, width, height, group, focal, centre, masked, own_mask, source.orientation, profile)
 
 
 def _mask(source: Source, whole: UInt8[np.ndarray, "h w c"], pixels: np.ndarray) -> Bool[np.ndarray, "height width"] | None:

@@ -25,6 +25,7 @@ from invgraphics.scenes.pictures.images import (
     exif_orientation,
     has_photographs,
     image_files,
+    profile_of,
     read_pixels,
 )
 from invgraphics.scenes.pictures.masks import mask_of, masks_folder, read_upright_mask
@@ -36,7 +37,8 @@ FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length
 class Source:
     """One picture, not read yet: its name, group, known intrinsics (of what ``load`` returns), mask and EXIF orientation.
 
-    ``load`` returns it upright. ``mask`` reads which pixels count, at the width and height of what ``load`` returns.
+    ``load`` returns it upright, in sRGB; ``profile`` reads the name of the colour profile it is converted from, if any.
+    ``mask`` reads which pixels count, at the width and height of what ``load`` returns.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Source:
     camera: Camera | None = None
     mask: Callable[[int, int], Bool[np.ndarray, "h w"]] | None = None
     orientation: int = 1
+    profile: Callable[[], str] | None = None
 
 
 def find_sources(job: PhotoJob, skipped: dict[str, str]) -> list[Source]:
@@ -84,7 +87,8 @@ def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
             mask = None if masks is None else mask_of(path.name, masks)
             read = None if mask is None else partial(read_upright_mask, mask, path)
             load, focal, orientation = partial(read_pixels, path), _focal_share(path, exif), exif_orientation(exif)
-            found.append(Source(readable(path.name), load, group, focal, mask=read, orientation=orientation))
+            profile = partial(profile_of, path)
+            found.append(Source(readable(path.name), load, group, focal, mask=read, orientation=orientation, profile=profile))
     for path in sorted(folder.iterdir()) if found else ():
         if path != masks and has_photographs(path):
             skipped[f"{readable(path.name)}/"] = "a folder with photographs of its own; put all of them into one"

@@ -24,6 +24,7 @@ from invgraphics.scenes.photos.plot import top_view
 from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
 from invgraphics.scenes.photos.quality import EMPTY_FIGURES, describe, refusal, unplaced
 from invgraphics.scenes.photos.result import write_scene
+from invgraphics.scenes.pictures.profiles import profile_words
 from invgraphics.scenes.process import worker_main, write_progress
 from invgraphics.tables import parse_json, read_json
 
@@ -102,6 +103,7 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         "given": len(photos) + len(skipped),
         "used": len(photos),
         "masked": sum(photo.own_mask for photo in photos),
+        **profile_words([photo.profile for photo in photos]),
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],
