@@ -6,7 +6,7 @@ from invgraphics.core import Mesh, Model, Quantity, Scene
 from invgraphics.core.scan import Scan
 from invgraphics.errors import InputError
 from invgraphics.fields.isosurface import extract_mesh
-from invgraphics.metrics.dtu import dtu_score
+from invgraphics.metrics.dtu import DENSITY, dtu_score
 from invgraphics.metrics.surface_metrics import SURFACE_METRICS
 from invgraphics.metrics.surfaces import F_SCORE_SHARE, POINTS, compare_surfaces
 from invgraphics.runs.scores import Score
@@ -94,6 +94,8 @@ def _dtu_scores(mesh: Mesh, scene: Scene, scan: Scan) -> Scored:
     except ValueError as error:
         return {}, dict.fromkeys(SURFACE_METRICS, f"{rule}: {error}")
     values = {"chamfer": found.overall, "surface_accuracy": found.accuracy, "surface_completeness": found.completeness}
+    if found.density < DENSITY:
+        rule += f"; {found.density:.3g} instead of {DENSITY:g} random points per mm² of a vast surface, before thinning"
     quality = {name: Score(mean=value, unit="mm", higher_is_better=False, joined=rule) for name, value in values.items()}
     return quality, dict.fromkeys(SURFACE_METRICS.keys() - values.keys(), "DTU's rule has no such score")
 
