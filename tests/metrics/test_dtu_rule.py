@@ -104,7 +104,7 @@ def test_large_surfaces_are_sampled_as_densely_as_small_ones(scan: Scan, monkeyp
     monkeypatch.setattr(dtu, "CHUNK", 40_000)  # the sphere alone takes one chunk
     alone, beside = dtu_score(small, scan), dtu_score(large, scan)
     assert beside.completeness == pytest.approx(alone.completeness, abs=0.002)
-    assert beside.density == alone.density == 50
+    assert beside.density == alone.density == dtu.DENSITY
     monkeypatch.setattr(dtu, "MOST_POINTS", 40_000)
     capped = dtu_score(large, scan)
     assert capped.completeness > alone.completeness + 0.005

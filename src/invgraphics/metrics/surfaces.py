@@ -141,6 +141,9 @@ def visible(mesh: Mesh, points: Float[Tensor, "n 3"], cameras: Sequence[Camera])
     """Which points of a mesh at least one camera sees: inside its picture and no farther than the mesh's depth map there.
 
     The depth is the largest of the four pixel centres around a point's image, so that no slope hides the surface from itself.
+    So some hidden surface counts where it is within a pixel of a silhouette in the picture: on `bricks` 0.425 of all points
+    count with depth maps of 256 pixels, 0.392 with 1024. A surface that lacks what is hidden has a completeness of up to 0.0006
+    there, however exact.
 
     Args:
         mesh: what hides the points.
