@@ -22,8 +22,8 @@ Scored = tuple[dict[str, Score], dict[str, str]]
 def surface_scores(model: Model, scene: Scene) -> Scored:
     """Score a model's surface: the ``quality`` and ``skipped`` parts of a ``scores.json``.
 
-    A signed distance is cut at zero, and its smallest pieces are left out (`SPECK`); a mesh is taken as it is. Other fields have no surface of their own; `export --to mesh`
-    scores what it extracts of them.
+    A signed distance is cut at zero, and its smallest pieces are left out (`SPECK`); a mesh is taken as it is. Other fields
+    have no surface of their own; `export --to mesh` scores what it extracts of them.
 
     Args:
         model: fitted.

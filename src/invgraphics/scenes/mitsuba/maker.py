@@ -46,7 +46,8 @@ def make(
         size: width and height in pixels. For this and what follows, ``None`` means what the scene's description says.
         train: number of training views.
         test: number of test views.
-        spp: samples per pixel of the training views; the other splits' keep their proportion to it.
+        spp: samples per pixel of the training views; the other splits' keep their proportion to it. Averages then serve only
+            if they have exactly these; without it, more samples than the description says are as good.
         seed: of the camera positions and of the renderer's noise.
         out: folder to put a copy into; ``None`` leaves the scene in the cache only.
         progress: called with (views done, views in all, what is being done).
@@ -59,7 +60,7 @@ def make(
     """
     job = planned(name, size, (train, test), spp, seed)
     folder = cache.root() / job.folder_name
-    if cache.read_truth(folder) is None and (smaller := averaged(job)) is not None:
+    if cache.read_truth(folder) is None and (smaller := averaged(job, exact=spp is not None)) is not None:
         job, folder = smaller, cache.root() / smaller.folder_name
     report = progress or (lambda done, total, what: None)
     if cache.read_truth(folder) is None:
