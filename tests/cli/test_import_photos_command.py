@@ -1,5 +1,6 @@
 """What ``import-photos`` asks for, prints and returns; the work itself is tested where it is done."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,18 @@ def test_too_few_photographs_are_refused_with_what_is_kept(given, capsys, tmp_pa
     captured = capsys.readouterr()
     assert "kept" not in captured.err
     assert "not placed: 15 more" in captured.out
+
+
+def test_a_refusal_says_that_the_earlier_scene_is_kept(given, capsys, tmp_path) -> None:
+    _, run = given
+    for folder, key in ((tmp_path / "scene", "earlier"), (tmp_path / "scene/refused", "later")):
+        folder.mkdir()
+        (folder / "quality.json").write_text(json.dumps({"key": key}))
+    refused = {"usable": False, "refusal": ["Only 2 of 10 photographs could be placed.", "Take more."], "registered": 2}
+    assert run(QUALITY | refused | {"key": "later"}) == main.BAD_INPUT
+    scene = tmp_path / "scene"
+    kept = f"What could be placed is kept in {scene / 'refused'}. {scene} keeps the usable scene of an earlier import."
+    assert kept in capsys.readouterr().err
 
 
 def test_options_reach_the_work(given) -> None:

@@ -15,7 +15,9 @@ from invgraphics.errors import InputError
 from invgraphics.experiments.surface_scores import mesh_scores
 from invgraphics.fields.analytic import Sphere
 from invgraphics.fields.isosurface import extract_mesh
+from invgraphics.metrics import dtu
 from invgraphics.metrics.dtu import dtu_score
+from invgraphics.metrics.surfaces import sample_surface
 from invgraphics.scenes.dtu import find_scan
 from invgraphics.testing import toy_scene
 
@@ -69,6 +71,46 @@ def test_only_what_was_observed_counts(scan: Scan) -> None:
     assert dtu_score(strays, scan).accuracy == pytest.approx(right.accuracy, abs=0.01)
     with pytest.raises(ValueError, match="where the scanner looked"):
         dtu_score(Mesh(exact.vertices + 500, exact.faces), scan)
+
+
+def thinned_at_once(mesh: Mesh, scan: Scan) -> tuple[float, float]:
+    """The rule by other means: all random points at once, thinned by a dictionary of cubes, distances by brute force."""
+    count = round(2 * float(trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False).area) / 0.2**2)
+    drawn = sample_surface(mesh, count, torch.Generator().manual_seed(0)).position
+    cubes: dict[tuple, int] = {}
+    for index, cube in enumerate(map(tuple, (drawn / 0.2).floor().tolist())):
+        cubes.setdefault(cube, index)
+    points = drawn[list(cubes.values())]
+    seen = points[scan.sees(points)]
+    means = []
+    for one, other in ((seen, scan.points), (scan.above_table(), points)):
+        nearest = torch.cat([torch.cdist(part, other).amin(dim=1) for part in one.split(500)])
+        means.append(float(nearest[nearest < 20].mean()))
+    return means[0], means[1]
+
+
+def test_the_rule_by_other_means(scan: Scan) -> None:
+    found = dtu_score(sphere(9.0), scan)
+    assert (found.accuracy, found.completeness) == pytest.approx(thinned_at_once(sphere(9.0), scan), abs=1e-9)
+    assert found.density == pytest.approx(50)
+
+
+def test_large_surfaces_are_sampled_as_densely_as_small_ones(scan: Scan, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sheet 30 mm away has 30 times the sphere's area: with a cap on the points it would cost the sphere its density."""
+    small = sphere(RADIUS)
+    corner = torch.tensor([[-80.0, -80.0, 50.0], [80.0, -80.0, 50.0], [80.0, 80.0, 50.0], [-80.0, 80.0, 50.0]])
+    sheet = torch.tensor([[0, 1, 2], [0, 2, 3]]) + len(small.vertices)
+    large = Mesh(torch.cat([small.vertices, corner]), torch.cat([small.faces, sheet]))
+    monkeypatch.setattr(dtu, "CHUNK", 40_000)  # the sphere alone takes one chunk
+    alone, beside = dtu_score(small, scan), dtu_score(large, scan)
+    assert beside.completeness == pytest.approx(alone.completeness, abs=0.002)
+    assert beside.density == alone.density == dtu.DENSITY
+    monkeypatch.setattr(dtu, "MOST_POINTS", 40_000)
+    capped = dtu_score(large, scan)
+    assert capped.completeness > alone.completeness + 0.005
+    assert capped.density == pytest.approx(40_000 / (160**2 + 4 * torch.pi * RADIUS**2), rel=0.01)
+    quality, _ = mesh_scores(large, replace(toy_scene(views=2, size=4), scan=scan))
+    assert "instead of 50 random points per mm²" in quality["chamfer"].joined
 
 
 def test_files_beside_the_cameras(scan: Scan, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import torch
 
 from invgraphics.core import Bounds, Mesh, Model
 from invgraphics.experiments.evaluate import score_model
+from invgraphics.experiments.job import in_region
 from invgraphics.experiments.surface_scores import mesh_scores
 from invgraphics.fields.analytic import Box, Sphere
 from invgraphics.fields.isosurface import extract_mesh
@@ -134,10 +135,25 @@ def test_scores_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert chamfer.mean == pytest.approx(0.2, abs=0.01)
     assert (chamfer.unit, chamfer.higher_is_better, chamfer.per_view) == ("world units", False, ())
     assert "0.2 world units" in distance.quality["f_score"].joined
+    declared = "48 voxels along the longest edge, 0 pieces of less than 0.1% of the triangles left out"
+    assert all(declared in distance.quality[name].joined for name in SURFACE_METRICS)
     mesh = Model(MeshField(truth, 0), SurfaceConfig().build(scene), scene.bounds)
-    assert score_model(mesh, scene, "float", "mesh").quality["chamfer"].mean == pytest.approx(0.0, abs=1e-2)
+    own = score_model(mesh, scene, "float", "mesh").quality["chamfer"]
+    assert own.mean == pytest.approx(0.0, abs=1e-2) and "voxels" not in own.joined
     density = score_model(Model(TwoBalls(), VolumetricConfig().build(scene), scene.bounds), scene, "float", "density")
     assert "chamfer" not in density.quality
     assert "--to mesh" in density.skipped["chamfer"]
     _, skipped = mesh_scores(truth, replace(scene, mesh=None))
     assert skipped == dict.fromkeys(SURFACE_METRICS, "the scene has no true surface")
+
+
+def test_the_f_score_of_a_run_in_its_own_box_has_the_data_sets_threshold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two concentric spheres 0.03 apart: within 1 % of the data set's box (4 wide), not of the run's (1.4 wide)."""
+    monkeypatch.setattr("invgraphics.experiments.surface_scores.POINTS", FEW)
+    wide = Bounds(-2 * torch.ones(3), 2 * torch.ones(3))
+    scene = replace(toy_scene(views=4, size=8), mesh=sphere(0.6), bounds=wide)
+    tight = in_region(scene, ((-0.7,) * 3, (0.7,) * 3))
+    again = in_region(tight, ((-0.65,) * 3, (0.65,) * 3))
+    found = [mesh_scores(sphere(0.63), seen)[0]["f_score"] for seen in (scene, tight, again)]
+    assert [score.mean for score in found] == [pytest.approx(1.0, abs=0.01)] * 3
+    assert len({score.joined for score in found}) == 1

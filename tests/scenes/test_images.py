@@ -12,11 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageOps
+from icc import P3_D50, SRGB_D50, matrix_profile
+from PIL import Image, ImageCms, ImageOps
 
 from invgraphics.core import Camera
 from invgraphics.errors import InputError
-from invgraphics.scenes.pictures.images import Photo, image_files, image_size, match_sizes, read_pixels, stored_size
+from invgraphics.scenes.pictures.images import (
+    Photo,
+    image_files,
+    image_size,
+    match_sizes,
+    profiles_note,
+    read_pixels,
+    stored_size,
+)
 from invgraphics.scenes.pictures.lens import Lens, straighten, undistort
 from invgraphics.scenes.pictures.resize import area_resize, wanted_size
 from invgraphics.scenes.pictures.views import load_view
@@ -58,6 +67,45 @@ def test_unchanged_size_keeps_every_byte(tmp_path: Path) -> None:
     view = load_view(Photo(tmp_path / "a.png", camera(5, 6), "a"))
     assert view.alpha is not None
     np.testing.assert_array_equal(np.dstack([view.image.numpy(), view.alpha.numpy()]), pixels)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_wide_colours_become_srgb(tmp_path: Path, channels: int) -> None:
+    """Against the matrices of the primaries in numpy; alpha is kept, and a loader's note names the profile."""
+    pixels = np.random.default_rng(0).integers(60, 190, (12, 16, channels), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=matrix_profile(P3_D50))
+    encoded = pixels[..., :3] / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    linear = (linear @ (np.linalg.inv(SRGB_D50) @ P3_D50).T).clip(0, 1)
+    expected = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055) * 255
+    found = read_pixels(tmp_path / "a.png")
+    assert np.abs(found[..., :3] - expected).max() < 1.6
+    assert np.abs(expected - pixels[..., :3]).max() > 5
+    np.testing.assert_array_equal(found[..., 3:], pixels[..., 3:])
+    photos = [Photo(tmp_path / "a.png", camera(16, 12), "a")]
+    assert profiles_note(photos) == {"colour_profile": "of 1 photographs converted to sRGB: 1 from wide"}
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", clip=True), pixels)  # numbers of labels are no colours
+
+
+def test_bytes_stay_under_srgb_and_broken_profiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    built_in = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    profiles = {"built-in": built_in, "matrix": matrix_profile(SRGB_D50), "none": None}
+    for name, profile in profiles.items():
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png", icc_profile=profile)
+        np.testing.assert_array_equal(read_pixels(tmp_path / f"{name}.png"), pixels)
+        assert profiles_note([Photo(tmp_path / f"{name}.png", camera(16, 12), name)]) == {}
+    assert capsys.readouterr().err == ""
+    for name, profile in {"cut": matrix_profile(P3_D50)[:200], "noise": b"anything"}.items():
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png", icc_profile=profile)
+        np.testing.assert_array_equal(read_pixels(tmp_path / f"{name}.png"), pixels)
+        assert f"the colour profile of {tmp_path / name}.png is broken" in capsys.readouterr().err
+
+
+def test_a_grey_picture_of_any_profile_keeps_its_levels(tmp_path: Path) -> None:
+    grey = np.arange(192, dtype=np.uint8).reshape(12, 16)
+    Image.fromarray(grey).save(tmp_path / "a.png", icc_profile=matrix_profile(P3_D50, gamma=1.8))
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png")[..., 0], grey)
 
 
 def test_opaque_alpha_channel_is_no_alpha(tmp_path: Path) -> None:

@@ -17,11 +17,13 @@ from scipy.spatial.transform import Rotation
 from invgraphics.scenes.open import SceneOptions, open_scene
 from invgraphics.scenes.photos import PhotoJob, attempts, reconstruct, sfm
 from invgraphics.scenes.photos.attempts import choice, try_all_pairs, try_strategies
+from invgraphics.scenes.photos.consistency import check_consistency
 from invgraphics.scenes.photos.mapping import Matched
 from invgraphics.scenes.photos.outlier_cameras import FAR, isolation, remove_outlier_cameras
 from invgraphics.scenes.photos.pairs import MatchedPair, VerifiedMatches
+from invgraphics.scenes.photos.panorama import is_panorama
 from invgraphics.scenes.photos.prepare import Prepared
-from invgraphics.scenes.photos.quality import registration_obstacle, unplaced
+from invgraphics.scenes.photos.quality import refusal, registration_obstacle, unplaced
 from invgraphics.scenes.photos.strategies import WIDE_ANGLE, Strategy, strategies
 
 COUNT = 10
@@ -299,15 +301,61 @@ def test_near_duplicates_isolate_no_other_camera() -> None:
 
 def test_a_film_is_not_taken_from_one_place() -> None:
     """Most pairs of a film are of neighbouring frames, which move by a few pixels; frames far apart move by hundreds."""
-    photos = [SimpleNamespace(width=1600, height=900, name=str(index)) for index in range(300)]
+    photos = [Prepared(str(index), str(index), 1600, 900, "") for index in range(300)]
     apart = [(first, first + step) for step in (1, 2, 4, 8, 64, 256) for first in range(300 - step)]
 
     def evidence(per_frame: float) -> VerifiedMatches:
-        pairs = [SimpleNamespace(first=a, second=b, motion=per_frame * (b - a)) for a, b in apart]
+        """Points of different depths move by a half to one and a half times as much."""
+        places = np.random.default_rng(0).uniform(0, 900, (40, 2))
+        rates = np.linspace(0.5, 1.5, 40)[:, None] * [per_frame, 0]
+        pairs = [MatchedPair(a, b, (places, places + (b - a) * rates)) for a, b in apart]
         return VerifiedMatches((5000,) * 300, tuple(pairs))
 
     assert registration_obstacle(photos, evidence(1.4)) is None
     assert "one and the same place" in registration_obstacle(photos, evidence(0.01))[0]
+
+
+@pytest.mark.parametrize("focal", [None, 1000.0])
+def test_a_panorama_is_taken_from_one_place(focal: float | None) -> None:
+    """Closed form: pixels of directions seen by a turning camera; with a step to the side at each turn they are no panorama."""
+    photos = [Prepared(str(index), str(index), 1000, 800, "", focal) for index in range(5)]
+    points = np.random.default_rng(0).uniform([-3, -3, 4], [3, 3, 9], (2000, 3))
+
+    def evidence(step: float) -> VerifiedMatches:
+        seen = []
+        for index in range(5):
+            rotation = Rotation.from_euler("yx", [6 * index, 2 * index], degrees=True).as_matrix()
+            local = (points - [step * index, 0, 0]) @ rotation.T
+            seen.append(1000 * local[:, :2] / local[:, 2:] + [500, 400])
+        inside = [((place > 0) & (place < [1000, 800])).all(axis=1) for place in seen]
+        shared = {(i, j): inside[i] & inside[j] for i, j in combinations(range(5), 2)}
+        pairs = [MatchedPair(i, j, (seen[i][both], seen[j][both])) for (i, j), both in shared.items()]
+        return VerifiedMatches((5000,) * 5, tuple(pairs))
+
+    assert "turns of the camera alone" in registration_obstacle(photos, evidence(0.0))[0]
+    assert registration_obstacle(photos, evidence(0.2)) is None
+
+
+def test_a_flat_wall_passed_by_is_no_panorama() -> None:
+    photos = [Prepared(str(index), str(index), 1600, 1200, "") for index in range(4)]
+    places = np.random.default_rng(0).uniform([0, 0], [1600, 1200], (400, 2))
+    pairs = [
+        MatchedPair(i, j, (places[places[:, 0] > 300], places[places[:, 0] > 300] - [300, 0])) for i, j in ((0, 1), (2, 3))
+    ]
+    assert not is_panorama(photos, VerifiedMatches((5000,) * 4, tuple(pairs)))
+
+
+def test_a_reconstruction_of_next_to_no_points_is_refused(truth) -> None:
+    """All cameras are placed by two points, as of a panorama; the matches contradict nothing."""
+    photos, evidence = photos_of(truth), evidence_of(truth)
+    assert refusal(photos, evidence, [image.num_points3D for image in truth.images.values()]) is None
+    for point in sorted(truth.points3D)[2:]:
+        truth.delete_point3D(point)
+    observed = [image.num_points3D for image in truth.images.values()]
+    assert remove_outlier_cameras(truth, photos) == {}
+    found = check_consistency(truth, photos, evidence)
+    assert found["suspicious"] and "2 points in the median" in found["sentence"]
+    assert refusal(photos, evidence, observed)[0].startswith("10 of 10 photographs were placed by next to nothing (2 points")
 
 
 def test_photographs_of_another_piece_are_told_of_it() -> None:
@@ -333,11 +381,17 @@ def test_a_scene_repeats_the_inconsistency_of_its_import(key: str, suspicious: b
     (tmp_path / "sparse/0").mkdir(parents=True)
     model.write(str(tmp_path / "sparse/0"))
     assert "poses" not in open_scene(str(tmp_path), SceneOptions()).notes
-    quality = {"key": "k", "choice": "global mapper", key: {"suspicious": suspicious, "sentence": "3 of 9 contradict"}}
+    profile = "of 9 photographs converted to sRGB: 9 from Display P3"
+    quality = {
+        "key": "k",
+        "choice": "global mapper",
+        "colour_profile": profile,
+        key: {"suspicious": suspicious, "sentence": "3 of 9 contradict"},
+    }
     (tmp_path / "quality.json").write_text(json.dumps(quality))
     for spelled in (".", "sparse", "sparse/0", "images"):  # any of the scene's folders names it
         notes = open_scene(str(tmp_path / spelled), SceneOptions()).notes
-        assert notes.get("poses") == "global mapper", spelled
+        assert (notes.get("poses"), notes.get("colour_profile")) == ("global mapper", profile), spelled
         assert notes.get("inconsistent_poses") == ("3 of 9 contradict" if suspicious else None)
 
 

@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 from dots import save
+from icc import P3_D50, matrix_profile
 from PIL import Image
 
 from invgraphics.errors import InputError
 from invgraphics.scenes.photos import PhotoJob, job
-from invgraphics.scenes.photos.maker import JOB, WORK, reconstruct
+from invgraphics.scenes.photos.maker import JOB, RESULT, WORK, reconstruct, result_folder
 from invgraphics.scenes.photos.prepare import Preparation, prepare
 from invgraphics.scenes.photos.result import _move_points, max_distortion, write_scene
 from invgraphics.scenes.photos.sfm import pairs
@@ -56,6 +57,7 @@ def test_copies_are_upright_reduced_and_grouped(tmp_path: Path) -> None:
     preparation = prepared(folder, tmp_path, max_size=100)
     assert [photo.name for photo in preparation.photos] == ["IMG_9.png", "IMG_10.png", "IMG_11.png", "IMG_12.png"]
     assert [(photo.width, photo.height) for photo in preparation.photos] == [(100, 50)] * 3 + [(50, 100)]
+    assert [photo.orientation for photo in preparation.photos] == [1, 1, 1, 8]
     assert len({photo.group for photo in preparation.photos}) == 2
     small = np.array(Image.open(tmp_path / "work/photos/IMG_12.png"))
     averaged = np.rot90(turned).reshape(100, 2, 50, 2, 3).mean(axis=(1, 3))
@@ -64,9 +66,23 @@ def test_copies_are_upright_reduced_and_grouped(tmp_path: Path) -> None:
     assert len({photo.group for photo in separate.photos}) == 4
 
 
+def test_working_copies_are_srgb_and_name_the_profile_they_had(tmp_path: Path) -> None:
+    picture = np.full((64, 64, 3), (200, 60, 60), np.uint8)
+    for index in range(3):
+        picture[0, 0] = index
+        profile = matrix_profile(P3_D50) if index else None
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        Image.fromarray(picture).save(tmp_path / f"photos/{index}.png", icc_profile=profile)
+    found = prepared(tmp_path / "photos", tmp_path).photos
+    assert [photo.profile for photo in found] == ["", "wide", "wide"]
+    copies = [np.array(Image.open(tmp_path / f"work/photos/{index}.png"))[9, 9].tolist() for index in range(3)]
+    assert copies[0] == [200, 60, 60] and copies[1] == copies[2] and copies[1][0] > 210
+    assert "icc_profile" not in Image.open(tmp_path / "work/photos/1.png").info
+
+
 def test_transparent_parts_are_masked_and_kept(tmp_path: Path) -> None:
     folder = tmp_path / "photos"
-    for index in range(2):
+    for index in range(3):
         picture = noise(index, 64, 64, 4)
         picture[..., 3] = np.where(np.arange(64) < 20, 0, 255)
         save(picture, folder / f"{index}.png")
@@ -180,12 +196,12 @@ def test_folders_without_photographs(content: dict[str, bytes], expected: str, t
 
 
 def test_photographs_in_folders_below_are_told_of(tmp_path: Path) -> None:
-    for seed, name in enumerate(("a.png", "b.png", "second camera/c.png")):
+    for seed, name in enumerate(("a.png", "b.png", "c.png", "second camera/d.png")):
         save(noise(seed, 64, 64), tmp_path / "photos" / name)
     save(np.full((64, 64), 255, np.uint8), tmp_path / "photos/masks/a.png.png")
     (tmp_path / "photos/notes").mkdir()
     found = prepared(tmp_path / "photos", tmp_path)
-    assert [photo.source for photo in found.photos] == ["a.png", "b.png"]
+    assert [photo.source for photo in found.photos] == ["a.png", "b.png", "c.png"]
     assert found.skipped == {"second camera/": "a folder with photographs of its own; put all of them into one"}
 
 
@@ -217,9 +233,18 @@ def test_a_decoder_that_is_installed_later_makes_another_import(tmp_path: Path, 
 
 def test_one_camera_cannot_have_two_sizes(tmp_path: Path) -> None:
     save(noise(0, 64, 48), tmp_path / "photos/a.png")
-    save(noise(1, 48, 64), tmp_path / "photos/b.png")
+    for index in (1, 2):
+        save(noise(index, 48, 64), tmp_path / f"photos/{index}.png")
     with pytest.raises(InputError, match="48x64, 64x48"):
         prepared(tmp_path / "photos", tmp_path, cameras="single")
+
+
+def test_two_photographs_are_refused_before_any_feature_is_sought(tmp_path: Path) -> None:
+    for index in range(2):
+        save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
+    with pytest.raises(InputError, match=r"only two photographs \(0\.png, 1\.png\)") as refused:
+        prepared(tmp_path / "photos", tmp_path)
+    assert "at least 3" in str(refused.value)
 
 
 def test_numbers_in_names_count_as_numbers() -> None:
@@ -287,7 +312,7 @@ def test_masks_beside_photographs_are_used(place: str, tmp_path: Path) -> None:
 
 
 def test_a_mask_that_cannot_be_used_leaves_its_photograph_out(tmp_path: Path) -> None:
-    for index in range(5):
+    for index in range(6):
         save(noise(index, 64, 64), tmp_path / f"photos/{index}.png")
     save(np.zeros((64, 64), np.uint8), tmp_path / "masks/0.png")
     save(np.full((64, 32), 255, np.uint8), tmp_path / "masks/1.png")
@@ -313,7 +338,7 @@ def test_masks_are_straightened_with_their_pictures(tmp_path: Path) -> None:
     params = [150.0, 80.0, 60.0, -0.2]
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=120, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(camera)
-    for number in (1, 2):
+    for number in (1, 2, 3):
         changed = picture.copy()
         changed[-1, -number] = 7  # no two may be the same
         save(np.repeat(changed[..., None], 3, axis=2), tmp_path / f"photos/{number}.png")
@@ -322,7 +347,7 @@ def test_masks_are_straightened_with_their_pictures(tmp_path: Path) -> None:
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([np.eye(3), [number, 0, 0]])))
     photos = prepared(tmp_path / "photos", tmp_path).photos
     assert write_scene(model, photos, tmp_path / "work", tmp_path / "result", quiet) > 3
-    for number in (1, 2):
+    for number in (1, 2, 3):
         dark = np.array(Image.open(tmp_path / f"result/images/{number}.png"))[:100, :100, 0] < 250
         left_out = np.array(Image.open(tmp_path / f"result/masks/{number}.png.png"))[:100, :100] == 0
         assert dark.sum() > 300 and (left_out | ~dark).all()
@@ -541,3 +566,32 @@ def test_an_interrupted_import_is_gone_on_with(tmp_path: Path, monkeypatch) -> N
             reconstruct(request, out)
     assert [first == second for first, second in pairwise(started)] == [True, False]
     assert left == [False, True, True]
+
+
+def test_a_refused_result_replaces_no_usable_one(tmp_path: Path, monkeypatch) -> None:
+    """It lies beside it and answers its own request; the next usable result replaces both."""
+    save(noise(0, 64, 64), tmp_path / "photos/0.png")
+    out, calls = tmp_path / "out", []
+
+    def work(module: str, folder: Path, *args, **kwargs) -> None:
+        asked = json.loads((folder / JOB).read_text())
+        seed = asked["job"]["seed"]
+        calls.append(seed)
+        (folder / RESULT / "images").mkdir(parents=True)
+        (folder / RESULT / "images" / f"{seed}.png").write_text("")
+        report = {"key": asked["key"], "job": asked["job"], "usable": seed % 2 == 0}
+        (folder / RESULT / "quality.json").write_text(json.dumps(report))
+
+    monkeypatch.setattr("invgraphics.scenes.photos.maker.run_worker", work)
+
+    def left(seed: int) -> tuple[bool, Path, list[str]]:
+        quality = reconstruct(PhotoJob(str(tmp_path / "photos"), seed=seed), out)
+        files = sorted(str(path.relative_to(out)) for path in out.glob("**/images/*"))
+        return quality["usable"], result_folder(out, quality), files
+
+    assert left(1) == (False, out, ["images/1.png"])
+    assert left(0) == (True, out, ["images/0.png"])
+    assert left(3) == left(3) == (False, out / "refused", ["images/0.png", "refused/images/3.png"])
+    assert left(0) == (True, out, ["images/0.png", "refused/images/3.png"])
+    assert calls == [1, 0, 3]
+    assert left(2) == (True, out, ["images/2.png"])

@@ -146,6 +146,9 @@ def forbid_processes(monkeypatch):
     [
         ({"size": SMALL, "spp": 8}, "average"),  # 2 samples in each of 4 pixels
         ({"size": SMALL, "spp": 9}, "render"),
+        ({"size": SMALL, "spp": 2}, "render"),  # more samples than were asked for are other noise
+        ({"size": SMALL}, "average"),
+        ({"size": (24, 18), "spp": 3}, "render"),  # 2 samples in each of 16/9 pixels are 3.6
         ({"size": SMALL, "train": 1}, "average"),  # the first of more views is the same view
         ({"size": SMALL, "train": 3}, "render"),
         ({"size": SMALL, "seed": 1}, "render"),

@@ -165,6 +165,18 @@ def test_interrupted_rendering_resumes_to_the_same_bytes(rendered, fresh, scene_
     assert reports[-1][:2] == (4, 4)
 
 
+def test_a_kill_while_the_truth_is_written_costs_no_view(rendered, fresh, scene_file, monkeypatch):
+    """All views and the half-written ``truth.json`` are there; the second run ends with a folder that counts as whole."""
+    partial = shutil.copytree(rendered, fresh / f"{rendered.name}.partial")
+    (partial / "truth.json").rename(partial / "truth.json.tmp")
+    before = (partial / "train/0000.npz").stat().st_mtime_ns
+    work_here(monkeypatch)
+    folder = make(scene_file)
+    assert (folder / "train/0000.npz").stat().st_mtime_ns == before
+    assert cache.read_truth(folder) is not None
+    assert _contents(folder) == _contents(rendered)
+
+
 def test_a_full_disk_is_named_and_rendering_goes_on_when_there_is_room(rendered, scene_file, tmp_path, monkeypatch):
     disk = tmp_path / "disk"
     disk.mkdir()

@@ -75,6 +75,61 @@ def test_poses_are_compared_without_the_pictures_in_memory(data_set, monkeypatch
     assert (truth["cameras"], truth["rotation_degrees"]["max"]) == (9, pytest.approx(10, abs=1e-3))
 
 
+@pytest.mark.parametrize("shape", [(16, 16), (20, 16)])
+@pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
+def test_cameras_of_turned_photographs_are_compared_as_stored(data_set, orientation: int, shape: tuple[int, int]) -> None:
+    """The upright picture's camera is the stored one's after a turn about its optical axis; of mirrored ones there is none."""
+    from PIL import Image
+
+    folder, poses = data_set
+    width, height = shape
+    table = json.loads((folder / "transforms.json").read_text()) | {"w": width, "h": height}
+    (folder / "transforms.json").write_text(json.dumps(table))
+    for path in (folder / "images").iterdir():
+        Image.new("RGB", shape).save(path)
+    degrees = {1: 0, 2: 0, 3: 180, 6: -90, 8: 90}[orientation]
+    upright = poses.copy()
+    upright[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    size = [height, width] if orientation in (6, 8) else [width, height]
+
+    def quality(found: np.ndarray) -> dict:
+        told = report(found, [f"{index:04}.png" for index in range(9)])
+        return told | {"cameras": [camera | {"size": size, "orientation": orientation} for camera in told["cameras"]]}
+
+    if orientation == 2:
+        with pytest.raises(InputError, match="has poses of 0 of the 9"):
+            compare(folder, quality(upright), folder)
+        return
+    assert compare(folder, quality(upright), folder)["rotation_degrees"]["median"] == pytest.approx(0, abs=1e-3)
+    if orientation in (6, 8) and width != height:  # a data set of the upright pictures
+        (folder / "transforms.json").write_text(json.dumps(table | {"w": height, "h": width}))
+        for path in (folder / "images").iterdir():
+            Image.new("RGB", (height, width)).save(path)
+        assert compare(folder, quality(poses), folder)["rotation_degrees"]["median"] == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_stored_picture_shows_what_the_upright_one_does(orientation: int) -> None:
+    """Pillow turns the stored picture upright; the pixel of a point goes where the upright camera sees the point."""
+    from PIL import Image, ImageOps
+
+    upright = torch.eye(4, dtype=torch.float64)
+    upright[:3, :3] = torch.from_numpy(Rotation.random(random_state=2).as_matrix())
+    upright[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    size = (40, 30) if orientation in (1, 3) else (30, 40)
+    point = upright[:3, :3] @ torch.tensor([-1.5, 0.7, 5.0], dtype=torch.float64) + upright[:3, 3]
+
+    def pixel(pose: torch.Tensor, size: tuple[int, int]) -> tuple[int, int]:
+        x, y, z = (pose[:3, :3].T @ (point - pose[:3, 3])).tolist()
+        return int(size[0] / 2 + 50 * x / z), int(size[1] / 2 + 50 * y / z)
+
+    stored = Image.new("L", size)
+    stored.putpixel(pixel(module.upright_to_stored(upright, orientation), size), 255)
+    exif = stored.getexif()
+    exif[0x0112] = orientation
+    assert ImageOps.exif_transpose(stored).getpixel(pixel(upright, (40, 30))) == 255
+
+
 def test_other_photographs_are_refused(data_set) -> None:
     folder, poses = data_set
     with pytest.raises(InputError, match="has poses of 0 of the 9"):
@@ -90,9 +145,9 @@ def test_names_that_splits_share_need_the_folder(tmp_path: Path) -> None:
         return View(Camera(pose, torch.ones(2), torch.ones(2), 2, 2), torch.zeros(2, 2, 3), "0000")
 
     scene = Scene("s", (view(1),), (view(2),), torch.zeros(3), Bounds(-torch.ones(3), torch.ones(3)))
-    known = module.true_poses(scene)
+    known = module.true_cameras(scene)
     assert known["0000"] is None
-    assert [float(known[name][0, 3]) for name in ("train/0000", "test/0000", "test-0000")] == [1, 2, 2]
+    assert [float(known[name].cam_to_world[0, 3]) for name in ("train/0000", "test/0000", "test-0000")] == [1, 2, 2]
     assert module._lookup(known, tmp_path / "test", "0000.png") is known["test/0000"]
     assert module._lookup(known, tmp_path / "other", "0000.png") is None
 

@@ -23,7 +23,8 @@ class ImportPhotos:
     The folder of the scene gets straight pictures, poses and points in COLMAP's format, quality.json, and a plot of cameras and
     points. Where a check finds the poses suspicious, or a tenth of the photographs that match others is not placed, other
     strategies are tried and the best result is kept. An interrupted import continues when the same command is given again;
-    another mapper or lens finds the features and matches of the last one in FOLDER/.import, which may be deleted.
+    another mapper or lens finds the features and matches of the last one in FOLDER/.import, which may be deleted. A result with
+    too few photographs replaces no usable one: it is written into FOLDER/refused.
 
     Attributes:
         folder: A folder of photographs, with masks of their names in `masks/` in it or beside it if there are any (dark pixels
@@ -63,6 +64,7 @@ class ImportPhotos:
 
         from invgraphics.experiments.progress import Reporter
         from invgraphics.scenes.photos import PhotoJob
+        from invgraphics.scenes.photos.maker import result_folder
         from invgraphics.tools.photos import import_photos
 
         job = PhotoJob(
@@ -81,8 +83,10 @@ class ImportPhotos:
         show_quality(quality)
         if not quality["usable"]:
             sentence, remedy = quality["refusal"]
-            kept = f" What could be placed is kept in {out}." if quality["registered"] else ""
-            raise InputError(sentence, remedy + kept)
+            place = result_folder(out, quality)
+            kept = f" What could be placed is kept in {place}." if quality["registered"] else ""
+            earlier = f" {out} keeps the usable scene of an earlier import." if place != out else ""
+            raise InputError(sentence, remedy + kept + earlier)
         print(out)
         return 0
 

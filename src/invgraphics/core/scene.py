@@ -157,6 +157,7 @@ class Scene:
             estimated from pixels that show the same points; ``None`` where it is unknown.
         noise_ceiling: PSNR in dB between two independent half-sample renders of the truth; ``None`` for photographs.
         notes: how the pixels came about (resize filter, undistortion, files skipped), recorded in each run.
+        data_bounds: those of the data set, where ``bounds`` is the part of them in which a run was fitted.
     """
 
     name: str
@@ -174,6 +175,7 @@ class Scene:
     exposure_spread: float | None = None
     noise_ceiling: float | None = None
     notes: dict[str, str] = field(default_factory=dict)
+    data_bounds: Bounds | None = None
 
     @property
     def scale(self) -> float:

@@ -120,11 +120,11 @@ def region_of(scene: Scene) -> Region | None:
 
 
 def in_region(scene: Scene, region: Region | None) -> Scene:
-    """Return a scene in the box in which a run was fitted; as it is where the run names none."""
+    """Return a scene in the box in which a run was fitted, with the data set's as `data_bounds`; as it is without a region."""
     if region is None or region == region_of(scene):
         return scene
     lo, hi = (torch.tensor(corner) for corner in region)
-    return replace(scene, bounds=replace(scene.bounds, lo=lo, hi=hi))
+    return replace(scene, bounds=replace(scene.bounds, lo=lo, hi=hi), data_bounds=scene.data_bounds or scene.bounds)
 
 
 def _training_data(request: FitRequest) -> TrainingData:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from invgraphics.core import Mesh, Model, Quantity, Scene
 from invgraphics.core.scan import Scan
 from invgraphics.errors import InputError
-from invgraphics.fields.isosurface import extract_mesh
-from invgraphics.metrics.dtu import dtu_score
+from invgraphics.fields.isosurface import SPECK, extract_mesh
+from invgraphics.metrics.dtu import DENSITY, dtu_score
 from invgraphics.metrics.surface_metrics import SURFACE_METRICS
 from invgraphics.metrics.surfaces import F_SCORE_SHARE, POINTS, compare_surfaces
 from invgraphics.runs.scores import Score
@@ -20,8 +22,8 @@ Scored = tuple[dict[str, Score], dict[str, str]]
 def surface_scores(model: Model, scene: Scene) -> Scored:
     """Score a model's surface: the ``quality`` and ``skipped`` parts of a ``scores.json``.
 
-    A signed distance is cut at zero, a mesh is taken as it is. Other fields have no surface of their own; `export --to mesh`
-    scores what it extracts of them.
+    A signed distance is cut at zero, and its smallest pieces are left out (`SPECK`); a mesh is taken as it is. Other fields
+    have no surface of their own; `export --to mesh` scores what it extracts of them.
 
     Args:
         model: fitted.
@@ -29,18 +31,21 @@ def surface_scores(model: Model, scene: Scene) -> Scored:
     """
     if reason := _unknown(scene):
         return {}, dict.fromkeys(SURFACE_METRICS, reason)
-    field = model.field
+    field, how = model.field, ""
     if Quantity.MESH in field.provides:
         mesh: Mesh = field.primitives(Quantity.MESH, model.context())
     elif Quantity.SDF in field.provides:
         try:
-            mesh = extract_mesh(field, model.bounds, RESOLUTION).mesh
+            extracted = extract_mesh(field, model.bounds, RESOLUTION)
         except InputError as error:
             return {}, dict.fromkeys(SURFACE_METRICS, error.sentence)
+        mesh, pieces = extracted.mesh, f"{extracted.dropped} pieces of less than {SPECK:.1%} of the triangles left out"
+        how = f"; signed distance at {RESOLUTION} voxels along the longest edge, {pieces}"
     else:
         reason = "the field has no surface of its own; `invgraphics export RUN --to mesh` scores the one that it extracts"
         return {}, dict.fromkeys(SURFACE_METRICS, reason)
-    return mesh_scores(mesh.to("cpu"), scene)
+    quality, skipped = mesh_scores(mesh.to("cpu"), scene)
+    return {name: replace(score, joined=score.joined + how) for name, score in quality.items()}, skipped
 
 
 def mesh_scores(mesh: Mesh, scene: Scene) -> Scored:
@@ -57,7 +62,8 @@ def mesh_scores(mesh: Mesh, scene: Scene) -> Scored:
     if scene.scan is not None:
         return _dtu_scores(mesh, scene, scene.scan)
     assert scene.mesh is not None
-    threshold = F_SCORE_SHARE * float((scene.bounds.hi - scene.bounds.lo).max())
+    box = scene.data_bounds or scene.bounds  # a run's own box would give each run another threshold
+    threshold = F_SCORE_SHARE * float((box.hi - box.lo).max())
     try:
         found = compare_surfaces(mesh, scene.mesh, threshold, [view.camera for view in scene.train], POINTS)
     except ValueError as error:
@@ -93,6 +99,8 @@ def _dtu_scores(mesh: Mesh, scene: Scene, scan: Scan) -> Scored:
     except ValueError as error:
         return {}, dict.fromkeys(SURFACE_METRICS, f"{rule}: {error}")
     values = {"chamfer": found.overall, "surface_accuracy": found.accuracy, "surface_completeness": found.completeness}
+    if found.density < DENSITY:
+        rule += f"; {found.density:.3g} instead of {DENSITY:g} random points per mm² of a vast surface, before thinning"
     quality = {name: Score(mean=value, unit="mm", higher_is_better=False, joined=rule) for name, value in values.items()}
     return quality, dict.fromkeys(SURFACE_METRICS.keys() - values.keys(), "DTU's rule has no such score")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from invgraphics.core import Mesh
@@ -17,7 +17,12 @@ SPACING = 0.2
 """Distance to which predicted points are thinned, mm."""
 FARTHEST = 20.0
 """Distances beyond this are outliers and do not count, mm."""
-MOST_POINTS = 2_000_000
+DENSITY = 2 / SPACING**2
+"""Random points per mm² of the predicted surface, before they are thinned."""
+CHUNK = 2_000_000
+"""Points that are drawn and thinned at a time."""
+MOST_POINTS = 50 * CHUNK
+"""Points that are drawn at most; of surfaces of more than two square metres the density is lower, and is stated."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +32,12 @@ class DtuScore:
     Attributes:
         accuracy: of predicted points in observed space to the scan.
         completeness: of the scan's points above the table to the prediction.
+        density: random points per mm² of the prediction, before thinning: `DENSITY`, or less on a vast surface.
     """
 
     accuracy: float
     completeness: float
+    density: float = DENSITY
 
     @property
     def overall(self) -> float:
@@ -42,7 +49,7 @@ def dtu_score(mesh: Mesh, scan: Scan, seed: int = 0) -> DtuScore:
     """Score a mesh against a structured-light scan by DTU's rule.
 
     The mesh becomes points no denser than `SPACING`: random ones, of which one per cube of that edge is kept (DTU's own program
-    thins random points by their distances).
+    thins random points by their distances). What lies too far from the scan to count is dropped as it is drawn.
 
     Args:
         mesh: in the scan's world, mm.
@@ -53,19 +60,36 @@ def dtu_score(mesh: Mesh, scan: Scan, seed: int = 0) -> DtuScore:
         ValueError: no predicted point lies in observed space, or one of the surfaces is nowhere near the other.
     """
     area = float(face_normals(mesh.vertices.double(), mesh.faces).norm(dim=1).sum()) / 2
-    count = min(MOST_POINTS, max(1000, round(2 * area / SPACING**2)))
-    points = _thinned(sample_surface(mesh, count, torch.Generator().manual_seed(seed)).position)
+    count = min(MOST_POINTS, max(1000, round(DENSITY * area)))
+    points = _thinned_samples(mesh, count, scan, torch.Generator().manual_seed(seed))
     seen = points[scan.sees(points)]
     if not len(seen):
         raise ValueError("no point of the predicted surface lies where the scanner looked")
-    return DtuScore(_mean_distance(seen, scan.points), _mean_distance(scan.above_table(), points))
+    density = DENSITY if count < MOST_POINTS else count / area
+    return DtuScore(_mean_distance(seen, scan.points), _mean_distance(scan.above_table(), points), density)
 
 
-def _thinned(points: Float[Tensor, "n 3"]) -> Float[Tensor, "k 3"]:
-    """The first point in every cube of edge `SPACING`."""
-    cubes, cube = torch.unique((points / SPACING).floor().long(), dim=0, return_inverse=True)
-    first = torch.full((len(cubes),), len(points)).scatter_reduce(0, cube, torch.arange(len(points)), "amin")
-    return points[first]
+def _thinned_samples(mesh: Mesh, count: int, scan: Scan, generator: torch.Generator) -> Float[Tensor, "k 3"]:
+    """Random points of a mesh, the first in every cube of edge `SPACING`, where they are near enough to the scan to count."""
+    margin = FARTHEST + 2 * SPACING  # cubes that the limit cuts are whole
+    lo, hi = scan.points.double().amin(dim=0) - margin, scan.points.double().amax(dim=0) + margin
+    cells = ((hi - lo) / SPACING).ceil().long() + 2
+    keys, points = torch.zeros(0, dtype=torch.int64), torch.zeros(0, 3, dtype=torch.float64)
+    for start in range(0, count, CHUNK):
+        drawn = sample_surface(mesh, min(CHUNK, count - start), generator).position
+        drawn = drawn[((drawn >= lo) & (drawn <= hi)).all(dim=1)]
+        cube = (drawn / SPACING).floor().long() - (lo / SPACING).floor().long()
+        key = (cube[:, 0] * cells[1] + cube[:, 1]) * cells[2] + cube[:, 2]
+        keys, points = _first_of_each(torch.cat([keys, key]), torch.cat([points, drawn]))
+    return points
+
+
+def _first_of_each(keys: Int[Tensor, " n"], points: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, " k"], Float[Tensor, "k 3"]]:
+    """The first point of each key, in the keys' order."""
+    ordered, order = keys.sort(stable=True)
+    first = torch.ones(len(keys), dtype=torch.bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return ordered[first], points[order[first]]
 
 
 def _mean_distance(points: Float[Tensor, "n 3"], to: Float[Tensor, "m 3"]) -> float:

@@ -99,10 +99,11 @@ def alpha_iou(pair: Pair) -> float:
 
 
 _SCORED = "where both alphas are >= 0.5"
+_FLAT = "the rendered truth's are of flat triangles"
 _SMOOTH = f"{_SCORED}, away from steps of more than 5% in the true depth"
 DEPTH_ABS_REL = Metric("depth_abs_rel", "", False, _abs_rel(smooth=False), f"mean |depth error| / true depth, {_SCORED}")
 DEPTH_RMSE = Metric("depth_rmse", "world units", False, _rmse(smooth=False), f"root mean squared depth error, {_SCORED}")
 DEPTH_ABS_REL_SMOOTH = Metric("depth_abs_rel_smooth", "", False, _abs_rel(smooth=True), f"as depth_abs_rel, {_SMOOTH}")
 DEPTH_RMSE_SMOOTH = Metric("depth_rmse_smooth", "world units", False, _rmse(smooth=True), f"as depth_rmse, {_SMOOTH}")
-NORMAL_DEG = Metric("normal_deg", "°", False, normal_angle, f"mean angle between normals, {_SCORED}")
+NORMAL_DEG = Metric("normal_deg", "°", False, normal_angle, f"mean angle between normals, {_SCORED}; {_FLAT}")
 ALPHA_IOU = Metric("alpha_iou", "", True, alpha_iou, "intersection over union of the silhouettes, alpha >= 0.5")

@@ -15,11 +15,12 @@ class SurfaceMetric:
     summary: str
 
 
+_SPECKS = "of signed distances at 192 voxels along the box, without pieces below 0.1% of the triangles"
 _VISIBLE = "on surface that a training camera sees"
 SURFACE_METRICS = {
     metric.name: metric
     for metric in (
-        SurfaceMetric("chamfer", "world units", False, "mean of surface_accuracy and surface_completeness"),
+        SurfaceMetric("chamfer", "world units", False, f"mean of surface_accuracy and surface_completeness; {_SPECKS}"),
         SurfaceMetric(
             "surface_accuracy", "world units", False, f"mean distance to the true surface of predicted points {_VISIBLE}"
         ),
@@ -27,7 +28,10 @@ SURFACE_METRICS = {
             "surface_completeness", "world units", False, f"mean distance to the predicted surface of true points {_VISIBLE}"
         ),
         SurfaceMetric(
-            "f_score", "", True, "harmonic mean of the shares of these points within 1% of the longest edge of the scene's box"
+            "f_score",
+            "",
+            True,
+            "harmonic mean of the shares of these points within 1% of the data set's box",
         ),
         SurfaceMetric(
             "normal_consistency", "", True, "mean |cosine| between the normals of these points and of the nearest ones"

@@ -17,7 +17,7 @@ from invgraphics.core.mesh import face_normals
 POINTS = 100_000
 """Points on either surface that are compared."""
 F_SCORE_SHARE = 0.01
-"""Threshold of the F-score, over the longest edge of the scene's box (Tatarchenko et al. 2019, §5.1)."""
+"""Threshold of the F-score, over the longest edge of the data set's box (Tatarchenko et al. 2019, §5.1)."""
 CANDIDATES = 8
 """Nearest samples of a surface whose triangles a distance to it is computed from."""
 VIEW_PIXELS = 256
@@ -141,6 +141,9 @@ def visible(mesh: Mesh, points: Float[Tensor, "n 3"], cameras: Sequence[Camera])
     """Which points of a mesh at least one camera sees: inside its picture and no farther than the mesh's depth map there.
 
     The depth is the largest of the four pixel centres around a point's image, so that no slope hides the surface from itself.
+    So some hidden surface counts where it is within a pixel of a silhouette in the picture: on `bricks` 0.425 of all points
+    count with depth maps of 256 pixels, 0.392 with 1024. A surface that lacks what is hidden has a completeness of up to 0.0006
+    there, however exact.
 
     Args:
         mesh: what hides the points.

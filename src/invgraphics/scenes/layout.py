@@ -15,7 +15,7 @@ from invgraphics.core import Points, Scene, View
 from invgraphics.core.transforms import apply_similarity, transform_points
 from invgraphics.errors import InputError
 from invgraphics.scenes.border import background_of, masking_blank
-from invgraphics.scenes.pictures.images import Photo, file_exists, match_sizes
+from invgraphics.scenes.pictures.images import Photo, file_exists, match_sizes, profiles_note
 from invgraphics.scenes.pictures.masks import masks_note
 from invgraphics.scenes.pictures.resize import RESIZE, wanted_size
 from invgraphics.scenes.pictures.views import load_view
@@ -165,7 +165,7 @@ def compose(name: str, split: Split, frame: LocalFrame, options: SceneOptions, n
     lenses = sorted({photo.lens.model for photo in photos if photo.lens is not None})
     if lenses:
         notes["undistortion"] = f"{', '.join(lenses)} removed at full size (bilinear), zoomed in until no pixel is blank"
-    notes |= masks_note(photos)
+    notes |= masks_note(photos) | profiles_note(photos)
     notes["resize"] = _resize_note(photos, views)
     first_test, first_val = len(views) - len(chosen.test), len(chosen.train)
     return Scene(

@@ -46,7 +46,8 @@ def make(
         size: width and height in pixels. For this and what follows, ``None`` means what the scene's description says.
         train: number of training views.
         test: number of test views.
-        spp: samples per pixel of the training views; the other splits' keep their proportion to it.
+        spp: samples per pixel of the training views; the other splits' keep their proportion to it. Averages then serve only
+            if they have exactly these; without it, more samples than the description says are as good.
         seed: of the camera positions and of the renderer's noise.
         out: folder to put a copy into; ``None`` leaves the scene in the cache only.
         progress: called with (views done, views in all, what is being done).
@@ -59,7 +60,7 @@ def make(
     """
     job = planned(name, size, (train, test), spp, seed)
     folder = cache.root() / job.folder_name
-    if cache.read_truth(folder) is None and (smaller := averaged(job)) is not None:
+    if cache.read_truth(folder) is None and (smaller := averaged(job, exact=spp is not None)) is not None:
         job, folder = smaller, cache.root() / smaller.folder_name
     report = progress or (lambda done, total, what: None)
     if cache.read_truth(folder) is None:
@@ -124,12 +125,22 @@ def _make(job: Job, folder: Path, progress: Progress, lock: int) -> None:
     try:
         shutil.rmtree(folder, ignore_errors=True)  # a broken one, see `cache.read_truth`
         partial.mkdir(exist_ok=True)
+        _remove_unfinished(partial)
         write_text(request, json.dumps(job.table()))
         _run(job, partial, progress, lock)
         request.unlink()
         partial.replace(folder)
     except OSError as error:
         raise cache.unwritable(partial, error) from error
+
+
+def _remove_unfinished(partial: Path) -> None:
+    """Remove files that a killed process was writing: ``truth.json`` would list its own among the scene's.
+
+    Not left out where ``truth.json`` is written: that module's source is part of the keys of all renderings.
+    """
+    for path in partial.rglob("*.tmp"):
+        path.unlink()
 
 
 def _run(job: Job, partial: Path, progress: Progress, lock: int) -> None:

@@ -16,7 +16,7 @@ from invgraphics.scenes.pictures.masks import mask_of, masks_folder
 from invgraphics.tables import parse_json
 from invgraphics.text import sha256_of
 
-SCHEMA = 2
+SCHEMA = 3
 DATABASE = "database.db"
 """COLMAP's data base of features and matches."""
 

@@ -26,6 +26,9 @@ MATCHES = (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm")
 RESULTS = ("images", FOLDER, "sparse", TOP_VIEW, QUALITY)
 """What the work process leaves for the folder, the proof of completeness last."""
 
+REFUSED = "refused"
+"""Folder, inside that of an earlier usable result, of a later result that is not usable: it replaces no usable one."""
+
 
 def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Poses, points and straight pictures of a folder of photographs, which `invgraphics.scenes.open` then opens by itself.
@@ -39,8 +42,8 @@ def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> d
         progress: called with (done, in all, what is being done).
 
     Returns:
-        The content of ``out``/quality.json. Its ``usable`` is false where too few photographs could be placed, with the reason
-        in ``refusal``; what could be placed is kept all the same.
+        The content of quality.json in `result_folder`, ``out`` as a rule. Its ``usable`` is false where too few photographs
+        could be placed, with the reason in ``refusal``; what could be placed is kept, but replaces no usable result.
 
     Raises:
         InputError: there are no photographs, the folder holds something else or cannot be written, or the work failed.
@@ -51,11 +54,23 @@ def reconstruct(job: PhotoJob, out: Path, progress: Progress | None = None) -> d
     with writing(out) as lock:
         _check_target(job, out)
         (out / WORK).mkdir(parents=True, exist_ok=True)
-        quality = read_quality(out)
-        if quality is None or quality["key"] != key:
-            quality = _make(job, key, out, report, lock)
+        quality = _read_result(out, key) or _make(job, key, out, report, lock)
         _clear(out / WORK, (JOB, *MATCHES))
     return quality
+
+
+def result_folder(out: Path, quality: dict[str, Any]) -> Path:
+    """Folder of the import that ``quality`` reports on: ``out``, or its `REFUSED` where an earlier usable result is kept."""
+    for folder in (out, out / REFUSED):
+        found = read_quality(folder)
+        if found is not None and found["key"] == quality.get("key"):
+            return folder
+    return out
+
+
+def _read_result(out: Path, key: str) -> dict[str, Any] | None:
+    """Read the report of the finished import with this key, usable or refused; ``None`` where there is none."""
+    return next((found for found in map(read_quality, (out, out / REFUSED)) if found is not None and found["key"] == key), None)
 
 
 @contextmanager
@@ -131,15 +146,26 @@ def _make(job: PhotoJob, key: str, out: Path, progress: Progress, lock: int) -> 
         remedy="If memory ran out, make them smaller (--max-size). Finished steps are kept for the same command.",
         lock=lock,
     )
-    for name in reversed(RESULTS):  # an old report goes first, a new one comes last
-        _remove(out / name)
-    for name in RESULTS:
-        if (work / RESULT / name).exists():
-            (work / RESULT / name).replace(out / name)
-    quality = read_quality(out)
+    _move_result(work / RESULT, out)
+    quality = _read_result(out, key)
     if quality is None:
         raise InputError(f"{out} was not written.", "Choose another --out.")
     return quality
+
+
+def _move_result(result: Path, out: Path) -> None:
+    """Move a finished result to ``out`` in place of the earlier one; to `REFUSED` if that one is usable and this one is not."""
+    earlier, made = read_quality(out), read_quality(result)
+    refused = earlier is not None and earlier.get("usable") and made is not None and not made["usable"]
+    target = out / REFUSED if refused else out
+    target.mkdir(exist_ok=True)
+    for name in reversed(RESULTS):  # an old report goes first, a new one comes last
+        _remove(target / name)
+    for name in RESULTS:
+        if (result / name).exists():
+            (result / name).replace(target / name)
+    if not refused:
+        _remove(out / REFUSED)
 
 
 def _clear(work: Path, but: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Notes of an imported scene on how its poses were found, and on what contradicts them."""
+"""Notes of an imported scene on how its poses were found, on what contradicts them, and on converted colours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from invgraphics.scenes.photos.maker import read_quality
 
 
 def pose_notes(folders: Iterable[Path]) -> dict[str, str]:
-    """Notes of a `Scene`: ``poses`` names the strategy, ``inconsistent_poses`` the failed consistency check.
+    """Notes of a `Scene`: ``poses`` names the strategy, ``inconsistent_poses`` the failed consistency check, ``colour_profile``
+    the profiles from which its photographs were converted to sRGB.
 
     Empty where none of ``folders`` holds a finished import; of several that do, the first counts.
     """
@@ -20,4 +21,6 @@ def pose_notes(folders: Iterable[Path]) -> dict[str, str]:
     consistency = quality.get("consistency")
     if isinstance(consistency, dict) and consistency.get("suspicious"):
         notes["inconsistent_poses"] = str(consistency.get("sentence") or "the poses contradict the matches")
+    if quality.get("colour_profile"):
+        notes["colour_profile"] = str(quality["colour_profile"])
     return notes

@@ -16,7 +16,8 @@ from invgraphics.scenes.photos.result import STRAIGHT, lens_of, max_distortion
 from invgraphics.scenes.pictures.lens import straightening_obstacle
 
 FEW_POINTS = 15
-"""Fewest observations of a camera that is kept: COLMAP accepts no pair of photographs with fewer verified matches."""
+"""Fewest observations of a camera that is kept: COLMAP accepts no pair of photographs with fewer verified matches. Where the
+median camera has fewer, the reconstruction is suspicious and not usable."""
 
 FAR = 10.0
 """`isolation` from which a camera is an outlier."""

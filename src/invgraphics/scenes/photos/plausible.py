@@ -1,4 +1,4 @@
-"""Plausibility of a reconstruction's cameras: focal length, distortion, and baseline over depth."""
+"""Plausibility of a reconstruction's cameras: focal length, distortion, baseline over depth, and observed points."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from invgraphics.scenes.photos.outlier_cameras import FEW_POINTS
 from invgraphics.scenes.photos.sources import FOCAL_RANGE
 
 LEAST_SPREAD = 0.01
@@ -28,7 +29,7 @@ def spread(model: Any) -> float:
 
 
 def implausible_parameters(model: Any) -> list[str]:
-    """Implausible focal lengths, distortions and baselines, in words; empty where there are none."""
+    """Implausible focal lengths, distortions, baselines and counts of points, in words; empty where there are none."""
     reasons: dict[str, None] = {}
     used = {image.camera_id for image in model.images.values() if image.has_pose}
     for camera in (model.cameras[number] for number in sorted(used)):
@@ -39,6 +40,9 @@ def implausible_parameters(model: Any) -> list[str]:
             reasons["the lens distortion folds the picture over"] = None
     if model.num_points3D() and (ratio := spread(model)) < LEAST_SPREAD:
         reasons[f"the cameras stand within {100 * ratio:.1f} % of the scene's distance"] = None
+    observed = [image.num_points3D for image in model.images.values() if image.has_pose]
+    if model.num_points3D() and (median := float(np.median(observed))) < FEW_POINTS:
+        reasons[f"a camera observes {median:.0f} points in the median"] = None
     return list(reasons)
 
 

@@ -27,6 +27,9 @@ PHOTOS, MASKS, OWN_MASKS, PREPARED = "photos", "masks", "own-masks", "prepared.j
 
 ADVICE = "Take 20 to 60 sharp photographs while walking around the scene, each overlapping its neighbours by two thirds."
 
+LEAST = 3
+"""Fewest photographs of a scene: no strategy keeps a reconstruction of fewer."""
+
 _OPAQUE = 128
 
 
@@ -44,6 +47,8 @@ class Prepared:
         centre: principal point, where the data set states it.
         masked: whether no features are looked for in parts of it: where it is transparent, or has a mask.
         own_mask: whether it has a mask, beside the photographs or of a data set, which the scene keeps.
+        orientation: EXIF orientation of the photograph, by which the working copy is turned upright.
+        profile: name of the colour profile from which the working copy is converted to sRGB; empty where it is not.
     """
 
     name: str
@@ -55,6 +60,8 @@ class Prepared:
     centre: tuple[float, float] | None = None
     masked: bool = False
     own_mask: bool = False
+    orientation: int = 1
+    profile: str = ""
 
 
 @dataclass(frozen=True)
@@ -80,7 +87,7 @@ def prepare(job: PhotoJob, work: Path, progress: Progress) -> Preparation:
     """Write the working copies into ``work``.
 
     Raises:
-        InputError: there are fewer than two different photographs that can be read.
+        InputError: there are fewer than `LEAST` different photographs that can be read.
     """
     (work / PHOTOS).mkdir(exist_ok=True)
     (work / MASKS).mkdir(exist_ok=True)
@@ -156,7 +163,9 @@ def _write(
         camera = source.camera.resized(width, height)
         focal = float(camera.focal.mean())
         centre = (float(camera.principal_point[0]), float(camera.principal_point[1]))
-    return Prepared(name, source.name, width, height, group, focal, centre, masked, mask is not None)
+    profile = "" if source.profile is None else readable(source.profile())
+    own_mask = mask is not None
+    return Prepared(name, source.name, width, height, group, focal, centre, masked, own_mask, source.orientation, profile)
 
 
 def _mask(source: Source, whole: UInt8[np.ndarray, "h w c"], pixels: np.ndarray) -> Bool[np.ndarray, "height width"] | None:
@@ -189,7 +198,7 @@ def _reason(name: str, error: InputError) -> str:
 
 def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> None:
     """Refuse photographs that no reconstruction is possible from."""
-    if len(photos) < 2:
+    if len(photos) < LEAST:
         _refuse(job.path, photos, skipped)
     sizes = {(photo.width, photo.height) for photo in photos}
     if job.cameras == "single" and len(sizes) > 1:
@@ -198,13 +207,15 @@ def _check(job: PhotoJob, photos: list[Prepared], skipped: dict[str, str]) -> No
 
 
 def _refuse(folder: Path, photos: list[Prepared], skipped: dict[str, str]) -> NoReturn:
-    what = f"only one photograph ({photos[0].source})" if photos else "no photograph"
+    names = ", ".join(photo.source for photo in photos)
+    what = ("no photograph", f"only one photograph ({names})", f"only two photographs ({names})")[len(photos)]
+    advice = f"A scene needs at least {LEAST}. {ADVICE}"
     if skipped:
         name, why = next(iter(skipped.items()))
         more = f" ({len(skipped)} files are left out)" if len(skipped) > 1 else ""
-        raise InputError(f"{folder} has {what} that can be used; {name}: {why}{more}.", ADVICE)
+        raise InputError(f"{folder} has {what} that can be used; {name}: {why}{more}.", advice)
     below = [str(path) for path in sorted(folder.iterdir()) if has_photographs(path)]
-    remedy = f"There are photographs in {below[0]}: name that folder." if below else ADVICE
+    remedy = f"There are photographs in {below[0]}: name that folder." if below else advice
     if len(below) > 1:
         remedy = f"There are photographs in {', '.join(below)}: name one of these folders, or put all photographs into one."
     raise InputError(f"{folder} has {what}.", remedy)

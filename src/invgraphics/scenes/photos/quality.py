@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from invgraphics.scenes.photos.outlier_cameras import FEW_POINTS
 from invgraphics.scenes.photos.pairs import VerifiedMatches
-from invgraphics.scenes.photos.prepare import ADVICE, Prepared
+from invgraphics.scenes.photos.panorama import is_panorama, widest_pairs
+from invgraphics.scenes.photos.prepare import ADVICE, LEAST, Prepared
 
-LEAST, SHARE = 3, 0.5
-"""A scene is usable when at least so many photographs, and this share of them, could be placed."""
+SHARE = 0.5
+"""A scene is usable when at least `LEAST` photographs, and this share of them, could be placed."""
 
 FEW_FEATURES = 200
 """A sharp photograph of a textured scene has thousands of SIFT features; below this one there is little to hold on to."""
@@ -21,7 +23,10 @@ NO_MOTION = 0.01
 
 
 def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:
-    """Figures of a reconstruction (before its lens is removed): counts, errors in pixels, cameras and lenses."""
+    """Figures of a reconstruction (before its lens is removed): counts, errors in pixels, cameras and lenses.
+
+    Cameras are those of the upright working copies, with their size and the EXIF orientation by which they were turned.
+    """
     placed = {image.name: image for image in model.images.values() if image.has_pose}
     cameras = []
     for photo in photos:
@@ -30,7 +35,7 @@ def describe(model: Any, photos: Sequence[Prepared]) -> dict[str, Any]:
             pose = np.eye(4)
             pose[:3] = image.cam_from_world().inverse().matrix()
             entry = {"name": photo.name, "source": photo.source, "points": image.num_points3D, "cam_to_world": pose.tolist()}
-            cameras.append(entry)
+            cameras.append(entry | {"size": [photo.width, photo.height], "orientation": photo.orientation})
     return {
         "registered": len(cameras),
         "points": model.num_points3D(),
@@ -103,32 +108,35 @@ def registration_obstacle(photos: Sequence[Prepared], evidence: VerifiedMatches)
     """Why no strategy can register these photographs, and a remedy; ``None`` where one may."""
     longest = max(max(photo.width, photo.height) for photo in photos)
     features = float(np.median(evidence.features))
-    motions = _largest_motions(evidence)
+    motions = [pair.motion for pair in widest_pairs(evidence).values()]
     if features < FEW_FEATURES:
         remedy = "Take sharp photographs of something with texture, in better light; or give a larger --max-size."
         return f"they show too little to recognise ({features:.0f} features each, blurred or bare).", remedy
+    remedy = "Step sideways between photographs: depth cannot be seen from one place."
     if motions and float(np.median(motions)) < NO_MOTION * longest:
-        remedy = "Step sideways between photographs: depth cannot be seen from one place."
         return "they are taken from one and the same place.", remedy
+    if is_panorama(photos, evidence):
+        return "they are taken from one place: turns of the camera alone explain their matches.", remedy
     if len(evidence.pairs) < len(photos) - 1:
         return f"they hardly overlap ({len(evidence.pairs)} pairs of them show a common part).", ADVICE
     return None
 
 
-def _largest_motions(evidence: VerifiedMatches) -> list[float]:
-    """Of each photograph with matches the largest motion to another: neighbours in a film have moved next to nothing."""
-    largest: dict[int, float] = {}
-    for pair in evidence.pairs:
-        for index in (pair.first, pair.second):
-            largest[index] = max(largest.get(index, 0.0), pair.motion)
-    return list(largest.values())
+def refusal(photos: Sequence[Prepared], evidence: VerifiedMatches, observed: Sequence[int]) -> tuple[str, str] | None:
+    """Why a reconstruction is not usable, and a remedy; ``None`` where it is.
 
-
-def refusal(photos: Sequence[Prepared], evidence: VerifiedMatches, registered: int) -> tuple[str, str] | None:
-    """Why too few photographs were registered, and a remedy; ``None`` where there are enough."""
-    if is_usable(registered, len(photos)):
+    Args:
+        photos: all of them.
+        evidence: their matches.
+        observed: how many points each registered photograph observes.
+    """
+    registered, points = len(observed), float(np.median(observed)) if observed else 0.0
+    enough = is_usable(registered, len(photos))
+    if enough and points >= FEW_POINTS:
         return None
     what = f"Only {registered} of {len(photos)} photographs could be placed" if registered else "No photograph could be placed"
+    if enough:
+        what = f"{registered} of {len(photos)} photographs were placed by next to nothing ({points:.0f} points in the median)"
     remedy = "Try --lens fisheye or --matching exhaustive; or take more photographs between those there are."
     why, remedy = registration_obstacle(photos, evidence) or ("their matches do not fit together.", remedy)
     return f"{what}: {why}", remedy

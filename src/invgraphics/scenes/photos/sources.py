@@ -17,7 +17,17 @@ from invgraphics.errors import InputError
 from invgraphics.scenes.layout import SceneOptions
 from invgraphics.scenes.photos.job import PhotoJob
 from invgraphics.scenes.pictures import png
-from invgraphics.scenes.pictures.images import PHONE, RAW, SUFFIXES, UNREADABLE, has_photographs, image_files, read_pixels
+from invgraphics.scenes.pictures.images import (
+    PHONE,
+    RAW,
+    SUFFIXES,
+    UNREADABLE,
+    exif_orientation,
+    has_photographs,
+    image_files,
+    profile_of,
+    read_pixels,
+)
 from invgraphics.scenes.pictures.masks import mask_of, masks_folder, read_upright_mask
 
 FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length is a mistake
@@ -25,8 +35,9 @@ FOCAL_RANGE = (0.2, 10.0)  # of the longest side; beyond it an EXIF focal length
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One picture, not read yet: its name, group, known intrinsics (of what ``load`` returns) and mask.
+    """One picture, not read yet: its name, group, known intrinsics (of what ``load`` returns), mask and EXIF orientation.
 
+    ``load`` returns it upright, in sRGB; ``profile`` reads the name of the colour profile it is converted from, if any.
     ``mask`` reads which pixels count, at the width and height of what ``load`` returns.
     """
 
@@ -36,6 +47,8 @@ class Source:
     focal_share: float | None = None  # focal length over the longest side
     camera: Camera | None = None
     mask: Callable[[int, int], Bool[np.ndarray, "h w"]] | None = None
+    orientation: int = 1
+    profile: Callable[[], str] | None = None
 
 
 def find_sources(job: PhotoJob, skipped: dict[str, str]) -> list[Source]:
@@ -73,7 +86,9 @@ def _files(folder: Path, skipped: dict[str, str]) -> list[Source]:
             group = "/".join(str(exif.get(tag, "")) for tag in _LENS_TAGS)
             mask = None if masks is None else mask_of(path.name, masks)
             read = None if mask is None else partial(read_upright_mask, mask, path)
-            found.append(Source(readable(path.name), partial(read_pixels, path), group, _focal_share(path, exif), mask=read))
+            load, focal, orientation = partial(read_pixels, path), _focal_share(path, exif), exif_orientation(exif)
+            profile = partial(profile_of, path)
+            found.append(Source(readable(path.name), load, group, focal, mask=read, orientation=orientation, profile=profile))
     for path in sorted(folder.iterdir()) if found else ():
         if path != masks and has_photographs(path):
             skipped[f"{readable(path.name)}/"] = "a folder with photographs of its own; put all of them into one"

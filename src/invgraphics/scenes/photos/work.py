@@ -24,6 +24,7 @@ from invgraphics.scenes.photos.plot import top_view
 from invgraphics.scenes.photos.prepare import PREPARED, Preparation, prepare
 from invgraphics.scenes.photos.quality import EMPTY_FIGURES, describe, refusal, unplaced
 from invgraphics.scenes.photos.result import write_scene
+from invgraphics.scenes.pictures.profiles import profile_words
 from invgraphics.scenes.process import worker_main, write_progress
 from invgraphics.tables import parse_json, read_json
 
@@ -95,12 +96,14 @@ def _finish(matched: Matched, skipped: dict[str, str], best: Attempt, result: Pa
         top_view(best.pieces[0], title, result / TOP_VIEW)
         bend = write_scene(best.pieces[0], photos, matched.work, result, clock.show)
     clock.start("")
-    refused, placed = refusal(photos, matched.evidence, figures["registered"]), {one["name"] for one in figures["cameras"]}
+    refused = refusal(photos, matched.evidence, [camera["points"] for camera in figures["cameras"]])
+    placed = {camera["name"] for camera in figures["cameras"]}
     return {
         "job": parse_json(job.text(), "the job"),
         "given": len(photos) + len(skipped),
         "used": len(photos),
         "masked": sum(photo.own_mask for photo in photos),
+        **profile_words([photo.profile for photo in photos]),
         **figures,
         "bend_px": bend,
         "other_pieces": [model.num_reg_images() for model in best.pieces[1:]],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from invgraphics.core import Camera
 from invgraphics.errors import InputError
 from invgraphics.scenes.pictures import png
 from invgraphics.scenes.pictures.lens import Lens
+from invgraphics.scenes.pictures.profiles import converted, profile_name, profile_words
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Suffixes of photographs, in lower case."""
@@ -36,6 +37,7 @@ _UPRIGHT = {
 }  # fmt: skip
 """Orientation -> Pillow's name of the transposition that makes the stored picture upright."""
 _OPPOSITE = {6: 8, 8: 6}  # quarter turns; every other orientation undoes itself
+_COLOURED = ("RGB", "RGBA", "RGBX", "RGBa", "P", "PA")  # modes whose colour profile may be one of RGB
 _WIDTH, _HEIGHT = 256, 257  # TIFF tags
 
 UNREADABLE = (OSError, ValueError, SyntaxError, TypeError, KeyError, OverflowError, struct.error)
@@ -108,13 +110,14 @@ def stored_size(path: Path) -> tuple[int, int]:
 def read_pixels(path: Path, like: tuple[int, int] | None = None, *, clip: bool = False) -> UInt8[np.ndarray, "h w c"]:
     """Read a photograph as 8-bit colour: upright, or, where its camera is known, as that was calibrated.
 
-    Sixteen-bit greys are rounded, palettes and greys become RGB. Structure from motion reads pixels as they are stored
-    (COLMAP ignores EXIF): with a camera the EXIF orientation is applied only where the stored shape is not the camera's.
+    Sixteen-bit greys are rounded, palettes and greys become RGB; colour with an embedded profile becomes sRGB. Structure from
+    motion reads pixels as they are stored (COLMAP ignores EXIF): with a camera the EXIF orientation is applied only where the
+    stored shape is not the camera's.
 
     Args:
         path: the file.
         like: the camera's (width, height), if it is known.
-        clip: whether sixteen-bit greys are cut off at 255 instead: numbers of labels.
+        clip: whether values are taken as they are, and sixteen-bit greys cut off at 255: numbers of labels.
 
     Returns:
         Straight colour with 3 channels, or 4 where the file has an alpha channel.
@@ -131,7 +134,19 @@ def read_pixels(path: Path, like: tuple[int, int] | None = None, *, clip: bool =
             grey = (levels if clip else levels / 257 + 0.5).clip(0, 255).astype(np.uint8)
             return np.repeat(grey[:, :, None], 3, axis=2)
         clear = turned.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in turned.info
-        return np.array(turned.convert("RGBA" if clear else "RGB"))
+        colour = turned.convert("RGBA" if clear else "RGB")
+        return np.array(converted(colour, image.info, path) if turned.mode in _COLOURED and not clip else colour)
+
+
+def profile_of(path: Path) -> str:
+    """Name of the colour profile from which `read_pixels` converts a photograph to sRGB; empty where it keeps the bytes."""
+    with _open(path) as image, _naming_damaged_file(path, image):
+        return profile_name(image.info) if image.mode in _COLOURED else ""
+
+
+def profiles_note(photos: Sequence[Photo]) -> dict[str, str]:
+    """A scene's note on photographs that are converted to sRGB; empty where none is."""
+    return profile_words([profile_of(photo.path) for photo in photos])
 
 
 def turn_like(pixels: UInt8[np.ndarray, "h w c"], photograph: Path) -> UInt8[np.ndarray, "height width c"]:
@@ -178,8 +193,12 @@ def _open(path: Path) -> Any:
 
 
 def _orientation(image: Any) -> int:
+    return exif_orientation(image.getexif())
+
+
+def exif_orientation(exif: Mapping[int, Any]) -> int:
     """EXIF orientation, 1 to 8; 1, as it is stored, where there is none or what is there is no such number."""
-    found = image.getexif().get(_ORIENTATION, 1)
+    found = exif.get(_ORIENTATION, 1)
     return found if found in _UPRIGHT else 1
 
 
