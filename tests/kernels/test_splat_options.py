@@ -216,6 +216,29 @@ def test_a_disc_seen_edge_on_keeps_a_pixels_width() -> None:
     assert 3 < int((alpha > 0.01).sum()) < 60
 
 
+def test_a_disc_seen_exactly_edge_on_has_finite_gradients() -> None:
+    """Its ray-disc intersection is 0 / 0; what is left is the low-pass filter's Gaussian around its centre."""
+    pose = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1.0, -2.0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])  # looks along +y
+    view = Camera(pose, torch.full((2,), 32.0), torch.full((2,), 16.0), 32, 32)
+    leaves = tuple(
+        tensor.requires_grad_()
+        for tensor in (
+            torch.tensor([[0.0, 0.0, 0.25]]),
+            torch.tensor([[0.5, 0.5, 0.5, 0.5]]),  # x to y, y to z, z to x: the plane is x = 0, which holds the camera
+            torch.tensor([[0.25, 0.125, 1e-3]]),
+            torch.tensor([0.75]),
+        )
+    )
+    footprints, rgb = reference.splat_project_discs(Gaussians(*leaves, torch.zeros(1, 1, 3)), view, 0.5)
+    _, alpha = reference.splat_rasterise(footprints, rgb, 32, 32)
+    pixels = torch.cartesian_prod(torch.arange(32), torch.arange(32)).flip(dims=(1,)) + 0.5
+    expected = 0.75 * torch.exp(-0.5 * (pixels - torch.tensor([16.0, 12.0])).square().sum(dim=1) / 0.5)
+    torch.testing.assert_close(alpha.flatten(), torch.where(expected < ALPHA_MIN, 0.0, expected))
+    (alpha * torch.arange(1024.0).view(32, 32)).sum().backward()
+    assert all(leaf.grad is None or bool(leaf.grad.isfinite().all()) for leaf in leaves)
+    assert leaves[0].grad is not None and bool(leaves[0].grad.any())
+
+
 def test_disc_gradients_by_finite_differences() -> None:
     view, base = camera(*SIZE).to(F64), discs(3)
     leaves = tuple(getattr(base, name).clone().requires_grad_() for name in ("means", "quaternions", "scales", "opacities"))
