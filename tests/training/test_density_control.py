@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from invgraphics.core import Bounds, Camera, Context, Quantity, Scene, Screen, Trace, View
-from invgraphics.core.transforms import look_at
+from invgraphics.core.transforms import look_at, quaternion_to_matrix
 from invgraphics.errors import InputError
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.renderers.gaussians.volume import GaussianExactConfig
@@ -70,6 +70,23 @@ def test_small_gaussians_with_large_gradients_are_cloned() -> None:
     assert state.field.primitive_count() == 8
     assert torch.equal(state.field.means[:6], before)
     assert torch.equal(state.field.means[6:], before[[1, 5]])
+
+
+def test_split_discs_stay_on_their_plane() -> None:
+    """The parts of a disc differ from it along its first two axes, while those of an ellipsoid leave the plane."""
+    for shape, flat in (("disc", True), ("ellipsoid", False)):
+        state = _state(8)
+        with torch.no_grad():
+            state.field.log_scales.fill_(math.log(0.5))
+        SplattingConfig(shape=shape).build(state.scene).prepare(state.field)
+        hook = DensityControlConfig(every=10, threshold=1.0, prune_extent=9.0).build()
+        _gradients(state, hook, [2.0] * 8)
+        normals = quaternion_to_matrix(state.field.quaternions.detach())[:, :, 2].repeat(2, 1)
+        before = state.field.means.detach().repeat(2, 1)
+        hook.after_step(state)
+        moved = state.field.means.detach() - before
+        assert state.field.primitive_count() == 16 and float(moved.norm(dim=1).min()) > 0.01
+        assert (float((moved * normals).sum(dim=1).abs().max()) < 0.01) == flat
 
 
 def test_gradient_is_averaged_over_the_views_that_see_a_gaussian() -> None:

@@ -18,11 +18,13 @@ from invgraphics.experiments.evaluate import evaluate
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import write_description
+from invgraphics.fields.discs import with_shortest_third
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
 from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import SMALLEST_SCALE, Splats, read_gaussians
 from invgraphics.formats.ply import FILTERED, OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
+from invgraphics.renderers.splatting import Splatting
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.folder import RunFolder
@@ -109,7 +111,8 @@ def import_run(request: ImportRequest) -> Path:
         folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
         model = build_model(job.method, scene, job.request.seed, job.device)
         assert isinstance(model.field, GaussianField)
-        fill(model.field, gaussians)
+        flat = isinstance(model.renderer, Splatting) and model.renderer.config.flat
+        fill(model.field, with_shortest_third(gaussians) if flat else gaussians)
         checkpoint.save(folder.checkpoint, model.state_dict())
         folder.append_history(Moment(step=0, seconds=0.0, progress=1.0, primitives=len(gaussians)))
         costs: dict[str, float | None] = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}

@@ -20,7 +20,8 @@ from invgraphics.kernels.reference.splat_project import (
 from invgraphics.kernels.types import Footprints
 
 EDGE_ON = 1e-6
-"""Volume spanned by a disc's axes and centre in homogeneous pixels, over the product of their lengths, below which it is seen edge-on."""
+"""Volume spanned by a disc's axes and centre in homogeneous pixels, over the product of their lengths, below which it is seen
+edge-on."""
 
 
 def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 0.5) -> tuple[Footprints, Float[Tensor, "n 3"]]:
@@ -30,9 +31,8 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
     are the images of the disc's axes and centre (2DGS, equation 7). M's inverse takes a pixel to where its ray meets the disc.
     """
     mean, in_front = in_camera(gaussians, camera)
-    axes = camera.cam_to_world[:3, :3].T @ quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
-    longest = gaussians.scales.argsort(dim=1, descending=True)[:, :2]
-    axes = axes.gather(2, longest[:, None, :].expand(-1, 3, 2))
+    turned = camera.cam_to_world[:3, :3].T @ quaternion_to_matrix(gaussians.quaternions)
+    axes = turned[:, :, :2] * gaussians.scales[:, None, :2]
     means2d = camera.principal_point + camera.focal * mean[:, :2] / mean[:, 2:]
     # The centre's column is written with its screen position, so that the screen-space gradient arrives at it.
     centre = mean[:, 2:] * torch.nn.functional.pad(means2d, (0, 1), value=1.0)
