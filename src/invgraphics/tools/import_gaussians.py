@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shlex
 import sys
 from dataclasses import asdict, dataclass, replace
@@ -18,10 +19,9 @@ from invgraphics.experiments.evaluate import evaluate
 from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import write_description
-from invgraphics.fields.discs import with_shortest_third
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
-from invgraphics.fields.similarity import transform_gaussians
-from invgraphics.formats.base import SMALLEST_SCALE, Splats, read_gaussians
+from invgraphics.fields.similarity import transform_gaussians, with_shortest_third
+from invgraphics.formats.base import DILATION, SMALLEST_SCALE, Splats, read_gaussians
 from invgraphics.formats.ply import FILTERED, OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
 from invgraphics.renderers.splatting import Splatting
@@ -100,10 +100,7 @@ def import_run(request: ImportRequest) -> Path:
     configure_torch(job.device)
     use_kernels(job.request.kernels, job.device)
     origin = _origin(request, name, splats, axes)
-    if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
-        also = " --set renderer.dilation=0.1" if FILTERED in splats.notes else ""
-        what = f"The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true{also} shows it so."
-        print(what, file=sys.stderr)
+    _advise_filter(splats, job.method.recipe.renderer)
     with folder.held():
         _check_empty(folder)
         folder.clear()
@@ -133,6 +130,20 @@ def _warn_of_frame(gaussians: Gaussians, scene: Scene, splats: Splats, request: 
         why = f"{maker} writes files in a frame of its own" if maker else "it may be in a frame of its own"
         what = f"Warning: {share:.0%} of the Gaussians lie in a training picture; {why}."
         print(f"{what} --transform dataparser_transforms.json, or --frame, places it.", file=sys.stderr)
+
+
+def _advise_filter(splats: Splats, renderer: object) -> None:
+    """Name the renderer's settings with which the file was fitted, by its flag and its notes, where the renderer has others."""
+    said = re.search(re.escape(DILATION) + r"(\d+(?:\.\d+)?(?:e-?\d+)?)", " ".join(splats.notes))
+    dilation = said[1] if said else "0.1" if FILTERED in splats.notes else None
+    settings = []
+    if splats.antialiased and not getattr(renderer, "antialiased", False):
+        settings.append("--set renderer.antialiased=true")
+    if dilation is not None and getattr(renderer, "dilation", None) not in (None, float(dilation)):
+        settings.append(f"--set renderer.dilation={dilation}")
+    if settings:
+        how = "with anti-aliasing" if splats.antialiased else "with another 2D filter"
+        print(f"The file says that it was fitted {how}; {' '.join(settings)} shows it so.", file=sys.stderr)
 
 
 def _check_empty(folder: RunFolder) -> None:
