@@ -21,6 +21,8 @@ from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import fit_run
 from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.formats.base import read_gaussians, write_gaussians
+from invgraphics.runs import checkpoint
+from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.runs.run import read_run
 from invgraphics.tools import EXPORTERS
 from invgraphics.tools.export import ExportRequest, export_run
@@ -48,6 +50,30 @@ def test_gaussians_that_are_shown_as_a_density_are_exported(toy_folder: Path, tm
     run = fit_run(FitRequest(**request, out=str(tmp_path / "run")))
     exported = export_run(ExportRequest(run, "ply", tmp_path / "model.ply"))
     assert any("PSNR" in name for name in exported.facts), exported.facts
+    assert "plain splatting" in exported.facts["drawn by"]
+
+
+def test_discs_are_exported_as_flat_ellipsoids_and_compared_as_viewers_show_them(toy_folder: Path, tmp_path: Path) -> None:
+    """The loss is that between the run's pictures and those of a run that the file is imported as."""
+    request = {"method": METHOD, "scene": str(toy_folder), "budget": "30steps"}
+    small = (*SMALL[METHOD], "renderer.shape=disc", "renderer.dilation=0.5")
+    run = fit_run(FitRequest(**request, out=str(tmp_path / "run"), overrides=small))
+    opened = fitted.open_fitted(run)
+    with torch.no_grad():
+        opened.model.field.log_scales[:, 2] = 0.0  # drawn by no disc, but as long as the scene in an ellipsoid
+    checkpoint.save(run / CHECKPOINT, opened.model.state_dict())
+    exported = export_run(ExportRequest(run, "ply", tmp_path / "a.ply"))
+    written = read_gaussians(tmp_path / "a.ply")[1].gaussians.scales
+    assert bool((written[:, 2] < 0.01 * written[:, :2].amin(dim=1)).all())
+    imported = FitRequest(**request, out=str(tmp_path / "b"), overrides=("renderer.dilation=0.5",))
+    back = fitted.open_fitted(import_run(ImportRequest(file=str(tmp_path / "a.ply"), run=imported)))
+    scene, psnr = opened.scene, []
+    for view in scene.test:
+        ours, theirs = (one.model.render(view.camera).over(scene.background).clamp(0, 1) for one in (opened, back))
+        psnr.append(-10 * float((ours - theirs).square().mean().log10()))
+    said = float(exported.facts["PSNR to the run's own pictures"].split()[0])
+    assert said == pytest.approx(sum(psnr) / len(psnr), abs=0.1) and 10 < said < 60
+    assert "0.5 px²" in exported.facts["drawn by"]
 
 
 @pytest.mark.parametrize(("to", "least"), [("ply", 120.0), ("splat", 50.0), ("spz", 50.0)])  # measured: 157, 57, 55
@@ -182,8 +208,19 @@ def test_an_antialiased_model_says_so_where_its_format_can(
     small = [word for change in SMALL[METHOD] for word in ("--set", change)]
     assert main.run([*fitted, *small, "--kernels", "reference"]) == main.DONE
     assert main.run(["export", str(tmp_path / "run"), "--to", to, "--out", str(tmp_path / f"model.{to}")]) == main.DONE
-    assert ("opacity compensation" in capsys.readouterr().out) == told
+    said = capsys.readouterr().out
+    assert ("opacity compensation" in said) == told and "0.1 px² where it is shown" in said
     assert read_gaussians(tmp_path / f"model.{to}")[1].antialiased == kept
+    back = ["import", str(tmp_path / f"model.{to}"), "--scene", str(toy_folder), "--out", str(tmp_path / "back")]
+    assert main.run(back) == main.DONE
+    advice = capsys.readouterr().err
+    assert ("--set renderer.antialiased=true" in advice) == bool(kept)
+    assert ("--set renderer.dilation=0.1" in advice) == (to == "ply")
+    if to == "ply":
+        same = [word for setting in re.findall(r"--set (\S+)", advice) for word in ("--set", setting)]
+        assert main.run([*back[:-1], str(tmp_path / "same"), *same]) == main.DONE
+        assert not capsys.readouterr().err.count("The file says")
+        assert _quality(tmp_path / "same")["psnr"] == pytest.approx(_quality(tmp_path / "run")["psnr"], abs=1e-3)
 
 
 def test_what_cannot_be_exported(run: Path, toy_folder: Path, tmp_path: Path, capsys) -> None:

@@ -192,10 +192,9 @@ def test_projected_discs_are_hit_where_rays_meet_their_plane() -> None:
     for i in range(len(all_discs)):
         alone = Footprints(**{name: value[i : i + 1] for name, value in vars(footprints).items() if value is not None})
         _, alpha = reference.splat_rasterise(alone, torch.zeros(1, 1, dtype=F64), *SIZE)
-        order = all_discs.scales[i].argsort()
-        axes = quaternion_to_matrix(all_discs.quaternions[i : i + 1])[0][:, order]
-        t = ((all_discs.means[i] - rays.origins) @ axes[:, 0]) / (rays.directions @ axes[:, 0])
-        offset = (rays.at(t) - all_discs.means[i]) @ axes[:, 1:] / all_discs.scales[i][order[1:]]
+        axes = quaternion_to_matrix(all_discs.quaternions[i : i + 1])[0]
+        t = ((all_discs.means[i] - rays.origins) @ axes[:, 2]) / (rays.directions @ axes[:, 2])
+        offset = (rays.at(t) - all_discs.means[i]) @ axes[:, :2] / all_discs.scales[i][:2]
         expected = torch.where(t > 0, all_discs.opacities[i] * torch.exp(-0.5 * offset.square().sum(dim=1)), 0.0)
         expected = torch.where(expected < ALPHA_MIN, 0.0, expected.clamp_max(0.99))
         torch.testing.assert_close(alpha.flatten(), expected, atol=1e-9, rtol=1e-6)
@@ -206,14 +205,37 @@ def test_a_disc_seen_edge_on_keeps_a_pixels_width() -> None:
     edge_on = replace(
         discs(1),
         means=torch.zeros(1, 3, dtype=F64),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]], dtype=F64),
-        scales=torch.tensor([[1e-4, 0.3, 0.3]], dtype=F64),
+        quaternions=torch.full((1, 4), 0.5, dtype=F64),  # x to y, y to z, z to x: the normal is across the view
+        scales=torch.tensor([[0.3, 0.3, 1e-4]], dtype=F64),
         opacities=torch.ones(1, dtype=F64),
     )
     footprints, rgb = reference.splat_project_discs(edge_on, view)
     _, alpha = reference.splat_rasterise(footprints, rgb, *SIZE)
     assert float(alpha.max()) > 0.6
     assert 3 < int((alpha > 0.01).sum()) < 60
+
+
+def test_a_disc_seen_exactly_edge_on_has_finite_gradients() -> None:
+    """Its ray-disc intersection is 0 / 0; what is left is the low-pass filter's Gaussian around its centre."""
+    pose = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1.0, -2.0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])  # looks along +y
+    view = Camera(pose, torch.full((2,), 32.0), torch.full((2,), 16.0), 32, 32)
+    leaves = tuple(
+        tensor.requires_grad_()
+        for tensor in (
+            torch.tensor([[0.0, 0.0, 0.25]]),
+            torch.tensor([[0.5, 0.5, 0.5, 0.5]]),  # x to y, y to z, z to x: the plane is x = 0, which holds the camera
+            torch.tensor([[0.25, 0.125, 1e-3]]),
+            torch.tensor([0.75]),
+        )
+    )
+    footprints, rgb = reference.splat_project_discs(Gaussians(*leaves, torch.zeros(1, 1, 3)), view, 0.5)
+    _, alpha = reference.splat_rasterise(footprints, rgb, 32, 32)
+    pixels = torch.cartesian_prod(torch.arange(32), torch.arange(32)).flip(dims=(1,)) + 0.5
+    expected = 0.75 * torch.exp(-0.5 * (pixels - torch.tensor([16.0, 12.0])).square().sum(dim=1) / 0.5)
+    torch.testing.assert_close(alpha.flatten(), torch.where(expected < ALPHA_MIN, 0.0, expected))
+    (alpha * torch.arange(1024.0).view(32, 32)).sum().backward()
+    assert all(leaf.grad is None or bool(leaf.grad.isfinite().all()) for leaf in leaves)
+    assert leaves[0].grad is not None and bool(leaves[0].grad.any())
 
 
 def test_disc_gradients_by_finite_differences() -> None:

@@ -87,6 +87,28 @@ def test_discs_agree_with_ellipses_where_both_are_small(make_camera: Callable[..
     assert float((disc.rgb - ellipse.rgb).abs().mean()) > 0
 
 
+def test_the_third_axis_of_discs_is_their_normal(make_camera: Callable[..., Camera]) -> None:
+    """Its scale changes neither the picture nor the normals, be it the longest, and has no gradient."""
+    view, splats = make_camera(), gaussians(10)
+    thin, thick = (
+        replace(splats, scales=torch.cat([splats.scales[:, :2], torch.full((10, 1), size, dtype=F64)], dim=1))
+        for size in (1e-4, 10.0)
+    )
+    thick.scales.requires_grad_()
+    ours, theirs = (render(each, view, shape="disc", dilation=0.5) for each in (thin, thick))
+    for name in ("rgb", "alpha", "depth", "normal"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
+    theirs.rgb.sum().backward()
+    assert bool(thick.scales.grad[:, :2].any()) and not bool(thick.scales.grad[:, 2].any())
+    one = Gaussians(**{name: value[:1] for name, value in vars(thick).items()})
+    one = replace(one, means=torch.zeros(1, 3, dtype=F64), opacities=torch.full((1,), 0.95, dtype=F64))
+    normal = render(one, view, shape="disc", dilation=0.5).normal
+    axis = quaternion_to_matrix(one.quaternions)[0, :, 2]
+    shown = normal[normal.norm(dim=2) > 0.5]
+    assert len(shown) > 0
+    torch.testing.assert_close((shown @ axis).abs(), torch.ones(len(shown), dtype=F64))
+
+
 def test_discs_are_fitted(make_camera: Callable[..., Camera]) -> None:
     view, splats = make_camera(), gaussians(10)
     for leaf in (splats.means, splats.scales, splats.quaternions):

@@ -6,14 +6,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from invgraphics.core import Bounds, Camera, Context, Quantity, Scene, Screen, Trace, View
-from invgraphics.core.transforms import look_at
+from invgraphics.core import Bounds, Camera, Context, Model, Quantity, Scene, Screen, Trace, View
+from invgraphics.core.transforms import look_at, quaternion_to_matrix
 from invgraphics.errors import InputError
 from invgraphics.fields.gaussian import GaussianFieldConfig
 from invgraphics.renderers.gaussians.volume import GaussianExactConfig
 from invgraphics.renderers.splatting import SplattingConfig
+from invgraphics.training.batches import BatchConfig
+from invgraphics.training.budget import Budget
 from invgraphics.training.density_control import DensityControlConfig
+from invgraphics.training.fit import Fit, Plan
 from invgraphics.training.hooks import FitState
+from invgraphics.training.losses import PhotometricLoss
 from invgraphics.training.optimiser import GroupConfig, Optimiser, OptimiserConfig
 
 XYZ_TO_YZX = (0.5, 0.5, 0.5, 0.5)
@@ -70,6 +74,23 @@ def test_small_gaussians_with_large_gradients_are_cloned() -> None:
     assert state.field.primitive_count() == 8
     assert torch.equal(state.field.means[:6], before)
     assert torch.equal(state.field.means[6:], before[[1, 5]])
+
+
+def test_split_discs_stay_on_their_plane() -> None:
+    """The parts of a disc differ from it along its first two axes, while those of an ellipsoid leave the plane."""
+    for shape, flat in (("disc", True), ("ellipsoid", False)):
+        state = _state(8)
+        with torch.no_grad():
+            state.field.log_scales.fill_(math.log(0.5))
+        SplattingConfig(shape=shape).build(state.scene).prepare(state.field)
+        hook = DensityControlConfig(every=10, threshold=1.0, prune_extent=9.0).build()
+        _gradients(state, hook, [2.0] * 8)
+        normals = quaternion_to_matrix(state.field.quaternions.detach())[:, :, 2].repeat(2, 1)
+        before = state.field.means.detach().repeat(2, 1)
+        hook.after_step(state)
+        moved = state.field.means.detach() - before
+        assert state.field.primitive_count() == 16 and float(moved.norm(dim=1).min()) > 0.01
+        assert (float((moved * normals).sum(dim=1).abs().max()) < 0.01) == flat
 
 
 def test_gradient_is_averaged_over_the_views_that_see_a_gaussian() -> None:
@@ -305,6 +326,25 @@ def test_statistics_of_earlier_checkpoints_are_read() -> None:
     old.load_state_dict({next((first for first, now in names.items() if now == name), name): v for name, v in written.items()})
     for name, value in old.state_dict().items():
         assert torch.equal(value, written[name]), name
+
+
+def test_resets_and_growth_follow_a_stretched_budget() -> None:
+    """40 of 40 steps become 40 of 200: resets at a tenth, a fifth and two fifths of these fall due after 20, 40 and 80."""
+    state = _state(4)
+    hook, due = DensityControlConfig(start=0.05, every=10_000, resets=(0.1, 0.2, 0.4)).build(), []
+    losses, budget = [PhotometricLoss(distance="l1")], Budget(steps=40)
+    model = Model(state.field, state.renderer, state.scene.bounds)
+    groups = OptimiserConfig({"field": GroupConfig("field", 1e-3)})
+    fit = Fit(Plan(model, state.scene, losses, [hook], groups, BatchConfig(), budget))
+    reset = hook._reset_opacities
+    hook._reset_opacities = lambda state: (due.append(state.step), reset(state))[1]
+    fit.run(lambda loss: False)
+    assert due == [5, 9, 17] and hook._started == 0.05
+    due.clear()
+    fit.set_budget(Budget(steps=200))
+    fit.run(lambda loss: False)
+    assert due == [81]
+    assert hook._started == pytest.approx(2 / 200)
 
 
 def test_resets_that_come_too_soon_are_left_out() -> None:

@@ -78,6 +78,20 @@ def test_noise_moves_the_faint_along_their_long_axis(quaternion: tuple[float, ..
     torch.testing.assert_close(moved[:1000].std(dim=0), expected, rtol=0.1, atol=0)
 
 
+@pytest.mark.parametrize("dead", [0.005, 0.1])
+@pytest.mark.parametrize("gate", [0.005, 0.1])
+def test_noise_goes_by_its_own_opacity(dead: float, gate: float) -> None:
+    """The standard deviation of the noise is the sigmoid of 100 times (``gate`` less opacity), whatever is relocated."""
+    state = _state(2000)
+    with torch.no_grad():
+        state.field.means.zero_()
+        state.field.log_scales.fill_(math.log(0.1))
+        state.field.opacity_logits.fill_(math.log(0.05 / 0.95))
+    RelocationConfig(every=1000, noise=1e6, dead=dead, gate=gate).build().after_step(state)
+    expected = 0.1**2 * 1e6 * 1e-9 / (1 + math.exp(-100 * (gate - 0.05)))
+    assert float(state.field.means.detach().std()) == pytest.approx(expected, rel=0.05)
+
+
 def test_nothing_dead_or_nothing_alive_is_left_alone() -> None:
     for logit in (-9.0, 3.0):
         state = _state(4)

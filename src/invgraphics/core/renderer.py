@@ -92,6 +92,9 @@ class Renderer(_StatefulModule, ABC):
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel of ``camera``; the rendering has shape (height, width)."""
 
+    def prepare(self, field: Field) -> None:
+        """Adapt a field's initial values to this renderer; called once, before a fit."""
+
     def update(self, field: Field, ctx: Context) -> None:
         """Refresh what is learnt without gradients; called once after each training step."""
 

@@ -66,6 +66,8 @@ def build_model(method: Method, scene: Scene, seed: int, device: torch.device, *
     field = _built(method.recipe.field, scene, Field, "provides")
     renderer = _built(method.recipe.renderer, scene, Renderer, "requires")
     check_subjects(field, renderer, scene, method.name)
+    if not shown:
+        renderer.prepare(field)
     model = Model(as_shown(field, renderer) if shown else field, renderer, scene.bounds)
     training = method.recipe.training
     if training is not None and training.poses is not None and training.poses.optimise:

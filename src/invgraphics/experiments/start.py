@@ -138,6 +138,7 @@ def initialise_field(plan: Plan, method: Method, scene_spec: str, scene: Scene) 
 
 
 def _with_field(plan: Plan, field: Field) -> Plan:
+    plan.model.renderer.prepare(field)
     return replace(plan, model=replace(plan.model, field=field.to(plan.device)))
 
 

@@ -8,7 +8,9 @@ from typing import Any
 
 from invgraphics.core import Field, Quantity, Renderer
 from invgraphics.fields.mesh import ExtractedMesh
+from invgraphics.fields.similarity import ShortestThird
 from invgraphics.recipes.recipe import Method, load_method, presets, resolve, split_name
+from invgraphics.renderers.splatting import Splatting
 from invgraphics.renderers.surface import Surface
 from invgraphics.text import sha256_of, slug
 
@@ -62,7 +64,8 @@ def with_renderer(method: Method, variant: RendererVariant) -> Method:
 
 
 def as_shown(field: Field, renderer: Renderer) -> Field:
-    """A fitted field as a renderer that did not fit it sees it: as the mesh of its surface, where the renderer needs one.
+    """A fitted field as a renderer that did not fit it sees it: as the mesh of its surface, where the renderer needs one,
+    and with the shortest axis of each Gaussian third, where it draws discs.
 
     Args:
         field: with a mesh, or with density or signed distance and radiance, it can be seen as a mesh.
@@ -71,4 +74,6 @@ def as_shown(field: Field, renderer: Renderer) -> Field:
     extractable = Quantity.RADIANCE in field.provides and (Quantity.SDF | Quantity.DENSITY) & field.provides
     if isinstance(renderer, Surface) and Quantity.MESH not in field.provides and extractable:
         return ExtractedMesh(field, renderer.config.resolution, renderer.config.level)
+    if isinstance(renderer, Splatting) and renderer.config.flat and Quantity.GAUSSIANS in field.provides:
+        return ShortestThird(field)
     return field

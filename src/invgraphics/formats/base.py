@@ -23,6 +23,8 @@ SMALLEST_SCALE = 1e-37
 
 ANTIALIASED = "anti-aliased: opacities are to be compensated"
 """Note of a file whose format has no place for Mip-Splatting's compensation (`Splats.antialiased`)."""
+DILATION = "renderer.dilation="
+"""What precedes, in a file's notes, the variance in square pixels of the 2D filter that its Gaussians were fitted with."""
 
 
 @dataclass(frozen=True, eq=False)

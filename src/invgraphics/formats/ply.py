@@ -47,7 +47,7 @@ class Ply:
     def read(self, path: Path) -> Splats:
         """Read a file of any SH degree up to 3; other properties and elements are ignored.
 
-        A `FILTER` is applied: scales are widened by it, and opacities lowered so that the integral stays (Mip-Splatting, §4.1).
+        A `FILTER` is applied: scales are widened by it, and opacities lowered so that the integral stays (Mip-Splatting, §5.1).
 
         Raises:
             InputError: it is no PLY file, is cut off, or lacks properties.

@@ -188,10 +188,10 @@ def splat_project(
 def splat_project_discs(
     gaussians: Gaussians, camera: Camera, dilation: float = 0.5
 ) -> tuple[types.Footprints, Float[Tensor, "n 3"]]:
-    """Flat discs instead of ellipsoids (2DGS, Huang et al. 2024, §4.2): each is spanned by its two longest axes.
+    """Flat discs instead of ellipsoids (2DGS, Huang et al. 2024, §4.2): each is spanned by its first two axes.
 
     Args:
-        gaussians: activated primitives; the shortest scale is ignored.
+        gaussians: activated primitives; the third axis is the normal, and its scale is ignored.
         camera: pinhole camera, differentiable in its pose.
         dilation: variance in square pixels of the smallest footprint (2DGS uses 0.5).
 

@@ -36,6 +36,7 @@ _ADDED_TO_HASH = {"min_spacing": 0.0}
 ADDED_KEYS: dict[str, dict[str, Any]] = {
     "field.neural": _ADDED_TO_NEURAL,
     "hooks.density_control": {"reset_spacing": 0, "split_threshold": 0.0},
+    "hooks.relocation": {"gate": 0.005},
     "hooks.upsample": {"min_spacing": 0.0},
     "optimiser": {"muon": 0.0, "muon_weight_decay": 0.0},
     "field.gaussians": {"dropout": 0.0, "dropout_views": 0},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -31,20 +32,23 @@ from invgraphics.kernels.types import Footprints
 from invgraphics.renderers.base import MIN_SURFACE_ALPHA, normals_from_depth, to_rendering
 from invgraphics.renderers.gaussians.profile import density_profile
 
+FLATNESS = 1e-3
+"""Third scale of a disc, which is not drawn, over the shorter of the others: where a fit begins, and in files."""
+
 
 @dataclass(frozen=True)
 class SplattingConfig:
     """Rasterised anisotropic Gaussians.
 
     Attributes:
-        shape: ``ellipsoid`` projects to an ellipse, to first order (EWA); ``disc`` drops the shortest axis and meets each
-            pixel's ray exactly (2DGS).
+        shape: ``ellipsoid`` projects to an ellipse, to first order (EWA); ``disc`` drops the third axis, which is the
+            disc's normal, and meets each pixel's ray exactly (2DGS).
         dilation: variance in square pixels added to every footprint (low-pass filter); of the smallest one, for discs
             (2DGS: 0.5).
         antialiased: whether that keeps a footprint's integral rather than its peak (Mip-Splatting, with ``dilation`` 0.1).
         depth: ``expected`` averages the distances of a pixel's splats by weight; ``median`` takes that of the splat at which
             half of the light is gone. For evaluation: gradients pass through the expected one only.
-        normals: ``shortest`` averages the splats' shortest axes; ``depth`` takes the slope of the depth map.
+        normals: ``shortest`` averages the splats' shortest axes (of discs the third); ``depth`` takes the depth map's slope.
         absolute_gradients: whether density control sees the sum of absolute gradients over pixels (AbsGS), in which opposite
             gradients do not cancel.
         max_grad_splats: how many splats of each pixel, from the front, receive its gradient; 0 for all (the paper's ablation of
@@ -68,8 +72,13 @@ class SplattingConfig:
             raise ValueError("dilation and max_grad_splats must not be negative")
         if self.tile is not None and self.tile < 1:
             raise ValueError(f"tile must be at least 1, not {self.tile}")
-        if self.shape == "disc" and (self.antialiased or self.absolute_gradients):
+        if self.flat and (self.antialiased or self.absolute_gradients):
             raise ValueError("'antialiased' and 'absolute_gradients' are not supported for discs")
+
+    @property
+    def flat(self) -> bool:
+        """Whether the third axis of each Gaussian is ignored."""
+        return self.shape == "disc"
 
     def build(self, scene: Scene) -> Splatting:
         """The renderer; it needs nothing from the scene."""
@@ -86,6 +95,20 @@ class Splatting(Renderer):
         self.config = config
         self.depth_kind = "median" if config.depth == "median" else "mean"
 
+    @override
+    @torch.no_grad()
+    def prepare(self, field: Field) -> None:
+        """Flatten the Gaussians that are to be discs, with random normals, as in 2DGS's code.
+
+        The third scale has no gradient. Left as long as the others, it would decide what density control splits and prunes, and
+        put the parts off the disc.
+        """
+        scales, quaternions = getattr(field, "log_scales", None), getattr(field, "quaternions", None)
+        if not self.config.flat or scales is None or quaternions is None:
+            return
+        quaternions.copy_(torch.nn.functional.normalize(torch.randn(len(quaternions), 4), dim=1))
+        scales[:, 2] = scales[:, :2].amin(dim=1) + math.log(FLATNESS)
+
     def render_image(self, field: Field, camera: Camera, ctx: Context) -> tuple[Rendering, Trace]:
         """Render every pixel. Depth is left at infinity in training, unless ``ctx.geometry`` is set."""
         gaussians: Gaussians = field.primitives(Quantity.GAUSSIANS, ctx)
@@ -94,7 +117,7 @@ class Splatting(Renderer):
         if ctx.geometry or not ctx.training:
             features.append(_distance_coefficients(footprints))
         if ctx.geometry:
-            features.append(_normals(gaussians, camera))
+            features.append(_normals(gaussians, camera, self.config.flat))
         size = camera.width, camera.height
         sums, alpha = kernels.splat_rasterise(
             footprints, torch.cat(features, dim=1), *size, self.config.tile, self.config.max_grad_splats
@@ -106,7 +129,7 @@ class Splatting(Renderer):
     def project(self, gaussians: Gaussians, camera: Camera) -> tuple[Footprints, Float[Tensor, "n 3"]]:
         """Project Gaussians; retains gradients of means2d in training. Returns footprints and colours."""
         config = self.config
-        if config.shape == "disc":
+        if config.flat:
             footprints, rgb = kernels.splat_project_discs(gaussians, camera, config.dilation)
         else:
             footprints, rgb = kernels.splat_project(gaussians, camera, config.dilation, config.antialiased)
@@ -138,7 +161,7 @@ class Splatting(Renderer):
         planes = footprints.depth_planes[order]
         t = planes[:, 0] + ((point - footprints.means2d[order]) * planes[:, 1:]).sum(dim=1)
         rays = camera.ray(pixel)
-        sigma = torch.zeros_like(t) if self.config.shape == "disc" else _deviations(gaussians, order, rays)
+        sigma = torch.zeros_like(t) if self.config.flat else _deviations(gaussians, order, rays)
         return Contributions(
             kind="splats",
             t=t,
@@ -184,10 +207,10 @@ def _distance_coefficients(footprints: Footprints) -> Float[Tensor, "n 3"]:
     return torch.cat([slopes, at_mean - (slopes * footprints.means2d).sum(dim=1, keepdim=True)], dim=1)
 
 
-def _normals(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
-    """Normal of each Gaussian: its shortest axis, turned towards the camera."""
-    shortest = gaussians.scales.argmin(dim=1)
+def _normals(gaussians: Gaussians, camera: Camera, flat: bool) -> Float[Tensor, "n 3"]:
+    """Normal of each Gaussian, turned towards the camera: its shortest axis, of a disc the third."""
     axes = quaternion_to_matrix(gaussians.quaternions)
-    normal = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    shortest = gaussians.scales.argmin(dim=1)[:, None, None].expand(-1, 3, 1)
+    normal = axes[:, :, 2] if flat else axes.gather(2, shortest)[:, :, 0]
     away = (normal * (gaussians.means - camera.position)).sum(dim=1, keepdim=True) > 0
     return torch.where(away, -normal, normal)

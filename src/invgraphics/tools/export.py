@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 
 from invgraphics import plugins
-from invgraphics.core import Camera, Gaussians, Quantity, harmonics
+from invgraphics.core import Camera, Gaussians, Quantity, Renderer, harmonics
 from invgraphics.errors import InputError
 from invgraphics.experiments.fitted import Fitted, open_fitted
 from invgraphics.experiments.progress import Reporter
 from invgraphics.fields.gaussian import FixedGaussians
 from invgraphics.fields.similarity import transform_gaussians
-from invgraphics.formats.base import ANTIALIASED, Splats, read_gaussians, write_gaussians
+from invgraphics.formats.base import ANTIALIASED, DILATION, Splats, read_gaussians, write_gaussians
 from invgraphics.formats.spz import WRITTEN
+from invgraphics.renderers.splatting import FLATNESS, Splatting, SplattingConfig
 from invgraphics.runs.folder import output_file
 from invgraphics.tools.file_frames import WORLD, file_from_local, local_from_file
 
@@ -106,20 +107,23 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
     axes = plugins.load("formats", request.to).axes
     local = on_cpu(fitted.model.gaussians())
     world = request.world or WORLD
-    placed = on_cpu(transform_gaussians(local, file_from_local(scene, axes, world).float()))
+    placed = on_cpu(transform_gaussians(_solid(local, fitted), file_from_local(scene, axes, world).float()))
     expected = getattr(plugins.load("formats", request.to), "sh_degree", None)
     placed = with_degree(placed, expected if request.sh_degree is None else request.sh_degree)
     shown = "" if scene.colour == "srgb" else f"; colours are {scene.colour}, not display sRGB"
-    antialiased = getattr(fitted.method.recipe.renderer, "antialiased", False)
+    viewer = splatter_of(fitted)
+    antialiased, dilation = viewer.config.antialiased, viewer.config.dilation
     flagged = getattr(plugins.load("formats", request.to), "flags_antialiasing", False)
     shown += f"; {ANTIALIASED}" if antialiased else ""
+    filtered = dilation != SplattingConfig.dilation
+    shown += f"; {DILATION}{dilation:g}" if filtered else ""
     note = f"invgraphics: {fitted.method.name} on {scene.name}, in the axes of the data set's world{shown}"
     settings = {} if request.spz_version is None else {"version": request.spz_version}
     write_gaussians(request.out, request.to, Splats(placed, axes, antialiased, (note,)), **settings)
 
     _, written = read_gaussians(request.out)
     back = transform_gaussians(written.gaussians, local_from_file(scene, written.axes, world).float())
-    loss = psnr_between(*(on_device(each, fitted.model.device) for each in (local, back)), fitted=fitted)
+    loss = psnr_between(*(on_device(each, fitted.model.device) for each in (local, back)), fitted=fitted, viewer=viewer)
     degree = harmonics.degree_of(written.gaussians.sh.shape[1])
     had = harmonics.degree_of(local.sh.shape[1])
     return Exported(
@@ -130,6 +134,8 @@ def export_gaussians(fitted: Fitted, request: ExportRequest) -> Exported:
             "SH degree": str(degree) if degree == had else f"{degree} (the run has {had})",
             "axes": axes or "the data set's world",
             **({"opacity compensation": "must be on where it is shown"} if antialiased and not flagged else {}),
+            **({"2D filter": f"{dilation:g} px² where it is shown, not {SplattingConfig.dilation:g}"} if filtered else {}),
+            **_drawn_by(viewer, fitted),
             "PSNR to the run's own pictures": decibels(loss),
         },
     )
@@ -144,21 +150,54 @@ def with_degree(gaussians: Gaussians, degree: int | None) -> Gaussians:
     return replace(gaussians, sh=sh)
 
 
-def psnr_between(gaussians: Gaussians, others: Gaussians, fitted: Fitted) -> list[float]:
-    """PSNR in dB between the pictures of two sets of Gaussians, one value for each test view; infinite where equal."""
+def splatter_of(fitted: Fitted) -> Splatting:
+    """The run's renderer, where it splats ellipsoids; else what viewers draw files with, of the run's 2D filter."""
+    renderer = fitted.model.renderer
+    if isinstance(renderer, Splatting) and not renderer.config.flat:
+        return renderer
+    config = SplattingConfig(dilation=renderer.config.dilation) if isinstance(renderer, Splatting) else SplattingConfig()
+    return config.build(fitted.scene)
+
+
+def _solid(gaussians: Gaussians, fitted: Fitted) -> Gaussians:
+    """The run's Gaussians as ellipsoids: of discs, whose third scale is not drawn, that one is made negligible."""
+    renderer = fitted.model.renderer
+    if not (isinstance(renderer, Splatting) and renderer.config.flat):
+        return gaussians
+    third = FLATNESS * gaussians.scales[:, :2].amin(dim=1, keepdim=True)
+    return replace(gaussians, scales=torch.cat([gaussians.scales[:, :2], third], dim=1))
+
+
+def _drawn_by(viewer: Splatting, fitted: Fitted) -> dict[str, str]:
+    """The fact that the file is drawn otherwise than the run, where it is."""
+    if viewer is fitted.model.renderer:
+        return {}
+    return {"drawn by": f"plain splatting, as in viewers ({viewer.config.dilation:g} px²), not by the run's renderer"}
+
+
+def psnr_between(gaussians: Gaussians, others: Gaussians, fitted: Fitted, viewer: Renderer) -> list[float]:
+    """PSNR in dB, for each test view, between a run's Gaussians and a file's; infinite where equal.
+
+    Args:
+        gaussians: drawn by the run's own renderer.
+        others: drawn by ``viewer``.
+        fitted: the run.
+        viewer: renderer of the file.
+    """
+    pairs = (gaussians, fitted.model.renderer), (others, viewer)
     psnr = []
     with Reporter("comparing") as reporter:
         for index, view in enumerate(fitted.scene.test):
-            ours, theirs = (render_gaussians(each, fitted, view.camera) for each in (gaussians, others))
+            ours, theirs = (render_gaussians(each, renderer, fitted, view.camera) for each, renderer in pairs)
             error = float((ours - theirs).square().mean())
             psnr.append(-10 * math.log10(error) if error else math.inf)
             reporter.show((index + 1) / len(fitted.scene.test), f"view {index + 1} of {len(fitted.scene.test)}")
     return psnr
 
 
-def render_gaussians(gaussians: Gaussians, fitted: Fitted, camera: Camera) -> Tensor:
-    """Render Gaussians through a run's renderer: colours over the scene's background, in [0, 1], (height, width, 3)."""
-    picture = replace(fitted.model, field=FixedGaussians(gaussians)).render(camera, normals=False)
+def render_gaussians(gaussians: Gaussians, renderer: Renderer, fitted: Fitted, camera: Camera) -> Tensor:
+    """Render Gaussians in a run's scene: colours over its background, in [0, 1], (height, width, 3)."""
+    picture = replace(fitted.model, field=FixedGaussians(gaussians), renderer=renderer).render(camera, normals=False)
     return picture.over(fitted.scene.background).clamp(0, 1)
 
 

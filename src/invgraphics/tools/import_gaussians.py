@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shlex
 import sys
 from dataclasses import asdict, dataclass, replace
@@ -20,10 +21,11 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.request import FitRequest
 from invgraphics.experiments.run import write_description
 from invgraphics.fields.gaussian import GaussianField, GaussianFieldConfig
-from invgraphics.fields.similarity import transform_gaussians
-from invgraphics.formats.base import SMALLEST_SCALE, Splats, read_gaussians
+from invgraphics.fields.similarity import transform_gaussians, with_shortest_third
+from invgraphics.formats.base import DILATION, SMALLEST_SCALE, Splats, read_gaussians
 from invgraphics.formats.ply import FILTERED, OPACITY_EPS
 from invgraphics.recipes.recipe import Method, resolve
+from invgraphics.renderers.splatting import Splatting
 from invgraphics.runs import checkpoint
 from invgraphics.runs.fit import FitRecord
 from invgraphics.runs.history import Moment
@@ -98,10 +100,7 @@ def import_run(request: ImportRequest) -> Path:
     configure_torch(job.device)
     use_kernels(job.request.kernels, job.device)
     origin = _origin(request, name, splats, axes)
-    if splats.antialiased and not getattr(job.method.recipe.renderer, "antialiased", False):
-        also = " --set renderer.dilation=0.1" if FILTERED in splats.notes else ""
-        what = f"The file says that it was fitted with anti-aliasing; --set renderer.antialiased=true{also} shows it so."
-        print(what, file=sys.stderr)
+    _advise_filter(splats, job.method.recipe.renderer)
     with folder.held():
         check_unused(folder)
         folder.clear()
@@ -109,7 +108,8 @@ def import_run(request: ImportRequest) -> Path:
         folder.write(replace(provenance, budget=IMPORTED, command=request.shell(), imported=origin))
         model = build_model(job.method, scene, job.request.seed, job.device)
         assert isinstance(model.field, GaussianField)
-        fill(model.field, gaussians)
+        flat = isinstance(model.renderer, Splatting) and model.renderer.config.flat
+        fill(model.field, with_shortest_third(gaussians) if flat else gaussians)
         checkpoint.save(folder.checkpoint, model.state_dict())
         folder.append_history(Moment(step=0, seconds=0.0, progress=1.0, primitives=len(gaussians)))
         costs: dict[str, float | None] = {"fit_seconds": None, "steps": None, "peak_memory_bytes": None}
@@ -130,6 +130,20 @@ def _warn_of_frame(gaussians: Gaussians, scene: Scene, splats: Splats, request: 
         why = f"{maker} writes files in a frame of its own" if maker else "it may be in a frame of its own"
         what = f"Warning: {share:.0%} of the Gaussians lie in a training picture; {why}."
         print(f"{what} --transform dataparser_transforms.json, or --frame, places it.", file=sys.stderr)
+
+
+def _advise_filter(splats: Splats, renderer: object) -> None:
+    """Name the renderer's settings with which the file was fitted, by its flag and its notes, where the renderer has others."""
+    said = re.search(re.escape(DILATION) + r"(\d+(?:\.\d+)?(?:e-?\d+)?)", " ".join(splats.notes))
+    dilation = said[1] if said else "0.1" if FILTERED in splats.notes else None
+    settings = []
+    if splats.antialiased and not getattr(renderer, "antialiased", False):
+        settings.append("--set renderer.antialiased=true")
+    if dilation is not None and getattr(renderer, "dilation", None) not in (None, float(dilation)):
+        settings.append(f"--set renderer.dilation={dilation}")
+    if settings:
+        how = "with anti-aliasing" if splats.antialiased else "with another 2D filter"
+        print(f"The file says that it was fitted {how}; {' '.join(settings)} shows it so.", file=sys.stderr)
 
 
 def without_zero_bands(gaussians: Gaussians) -> Gaussians:

@@ -251,10 +251,12 @@ class Fit:
         self._speed = SpeedProbe(float(record.get("processor_speed") or 0.0), int(record.get("speed_probes") or 0))
 
     def set_budget(self, budget: Budget) -> None:
-        """Replace the budget; learning rates that were restarted stay restarted at the same step."""
+        """Replace the budget; what hooks have begun and learning rates that were restarted stay so at the same step."""
         before = self.progress
         self.plan = replace(self.plan, budget=budget)
         self._optimiser.move_restart(self.progress / before if before else 1.0)
+        for hook in self.plan.hooks:
+            hook.rescale_progress(before, self.progress)
 
     def run(self, after_step: Callable[[float], bool]) -> None:
         """Step until the budget is spent or ``after_step(loss)`` returns True."""

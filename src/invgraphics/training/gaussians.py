@@ -1,10 +1,11 @@
-"""Gaussians as density control, relocation, smoothing and limits see them: parameters that can be replaced row by row."""
+"""Gaussians as density control, relocation, smoothing and limits see them: parameters replaced row by row, rounds of growth."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from invgraphics.training.checks import Requirement
@@ -25,6 +26,23 @@ class GaussianParameters(Protocol):
     def replace(self, tensors: dict[str, Tensor]) -> None:
         """Replace all parameters by new ones, of any common number of rows."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class GrowthRound:
+    """What a round of growing and pruning did to each of the n Gaussians before it; all others were kept.
+
+    Attributes:
+        step: steps of the fit when it was over.
+        cloned: those that got a copy.
+        split: those that were replaced by smaller ones.
+        pruned: those that were removed.
+    """
+
+    step: int
+    cloned: Bool[Tensor, " n"]
+    split: Bool[Tensor, " n"]
+    pruned: Bool[Tensor, " n"]
 
 
 GAUSSIANS = Requirement("Gaussians", GaussianParameters)

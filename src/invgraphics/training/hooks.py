@@ -93,6 +93,9 @@ class Hook:
     def after_step(self, state: FitState) -> None:
         """Called after the optimiser's step."""
 
+    def rescale_progress(self, before: float, after: float) -> None:
+        """Called when another budget gives the steps so far the progress ``after`` instead of ``before``."""
+
     def state_dict(self) -> dict[str, Tensor]:
         """Tensors that a resumed fit needs."""
         return {}

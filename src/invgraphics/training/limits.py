@@ -73,6 +73,13 @@ class Limits(Hook):
         )
 
     @override
+    def before_step(self, state: FitState) -> None:
+        """Note which rows loaded limits are of, before another hook may replace them in this step."""
+        field = cast(GaussianParameters, state.field)
+        if self._means is None and len(self._log_limit) == len(field.means):
+            self._field, self._means = field, field.means
+
+    @override
     @torch.no_grad()
     def after_step(self, state: FitState) -> None:
         config, field = self._config, cast(GaussianParameters, state.field)

@@ -37,6 +37,7 @@ class RelocationConfig:
         max_primitives: cap.
         cap_ramp: progress, from ``start`` on, over which the cap rises from the first number, by equal factors; 0 for at once.
         noise: standard deviation of the noise on means, per learning rate and covariance; 0 for none.
+        gate: opacity at which a Gaussian gets half of the noise, more opaque ones less (the authors' constant).
     """
 
     start: float = 1 / 60
@@ -47,12 +48,13 @@ class RelocationConfig:
     max_primitives: int = 1_000_000
     cap_ramp: float = 0.0
     noise: float = 5e5
+    gate: float = 0.005
 
     def __post_init__(self) -> None:
         if self.every < 1 or self.max_primitives < 1:
             raise ValueError("'every' and 'max_primitives' must be at least 1.")
-        if not 0 < self.dead < 1 or min(self.growth, self.noise, self.cap_ramp) < 0:
-            raise ValueError("'dead' must lie between 0 and 1, 'growth', 'noise' and 'cap_ramp' must not be negative.")
+        if not (0 < self.dead < 1 and 0 < self.gate < 1) or min(self.growth, self.noise, self.cap_ramp) < 0:
+            raise ValueError("'dead' and 'gate' must lie between 0 and 1, 'growth', 'noise' and 'cap_ramp' at 0 or above.")
 
     def capped(self, most: int) -> RelocationConfig:
         """The same, growing to at most ``most`` Gaussians."""
@@ -81,7 +83,7 @@ class Relocation(Hook):
             self._relocate(state)
             self._grow(state)
         if config.noise:
-            _perturb(state, config.noise * state.optimiser.rate_of("field.means"), config.dead)
+            _perturb(state, config.noise * state.optimiser.rate_of("field.means"), config.gate)
 
     def _relocate(self, state: FitState) -> None:
         """Move dead Gaussians to living ones, drawn by opacity."""
@@ -152,10 +154,10 @@ def relocated_opacity(
     return each.to(opacity), (wide / total).to(opacity)
 
 
-def _perturb(state: FitState, strength: float, dead: float) -> None:
+def _perturb(state: FitState, strength: float, middle: float) -> None:
     """Add Langevin noise with each Gaussian's covariance to the means of nearly transparent Gaussians (equation 8)."""
     field = cast(GaussianParameters, state.field)
-    gate = torch.sigmoid(GATE_SLOPE * (dead - torch.sigmoid(field.opacity_logits)))
+    gate = torch.sigmoid(GATE_SLOPE * (middle - torch.sigmoid(field.opacity_logits)))
     rows = (gate > NEGLIGIBLE).nonzero()[:, 0]
     if len(rows) == 0:
         return

@@ -19,6 +19,10 @@ from invgraphics.kernels.reference.splat_project import (
 )
 from invgraphics.kernels.types import Footprints
 
+EDGE_ON = 1e-6
+"""Volume spanned by a disc's axes and centre in homogeneous pixels, over the product of their lengths, below which it is seen
+edge-on."""
+
 
 def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 0.5) -> tuple[Footprints, Float[Tensor, "n 3"]]:
     """See `invgraphics.kernels.splat_project_discs`.
@@ -27,9 +31,8 @@ def splat_project_discs(gaussians: Gaussians, camera: Camera, dilation: float = 
     are the images of the disc's axes and centre (2DGS, equation 7). M's inverse takes a pixel to where its ray meets the disc.
     """
     mean, in_front = in_camera(gaussians, camera)
-    axes = camera.cam_to_world[:3, :3].T @ quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
-    longest = gaussians.scales.argsort(dim=1, descending=True)[:, :2]
-    axes = axes.gather(2, longest[:, None, :].expand(-1, 3, 2))
+    turned = camera.cam_to_world[:3, :3].T @ quaternion_to_matrix(gaussians.quaternions)
+    axes = turned[:, :, :2] * gaussians.scales[:, None, :2]
     means2d = camera.principal_point + camera.focal * mean[:, :2] / mean[:, 2:]
     # The centre's column is written with its screen position, so that the screen-space gradient arrives at it.
     centre = mean[:, 2:] * torch.nn.functional.pad(means2d, (0, 1), value=1.0)
@@ -61,13 +64,14 @@ def homogeneous(directions: Float[Tensor, "n 3 k"], camera: Camera) -> Float[Ten
 
 
 def _inverse(matrix: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
-    """Inverse by cross products; a disc seen exactly edge-on gives something finite that no ray hits."""
+    """Inverse by cross products; zero where a disc is seen edge-on within rounding, so that every ray misses it."""
     u, v, w = matrix.unbind(dim=2)
     rows = [torch.linalg.cross(v, w), torch.linalg.cross(w, u), torch.linalg.cross(u, v)]
     det = (u * rows[0]).sum(dim=1)
-    smallest = torch.finfo(det.dtype).tiny ** 0.5
-    det = torch.where(det.abs() < smallest, smallest, det)
-    return torch.stack(rows, dim=1) / det[:, None, None]
+    # Beyond that angle the inverse is rounding error, and so large that products of its gradients overflow to NaN.
+    flat = det.abs() < EDGE_ON * u.norm(dim=1) * v.norm(dim=1) * w.norm(dim=1)
+    inverse = torch.stack(rows, dim=1) / torch.where(flat, 1.0, det)[:, None, None]
+    return torch.where(flat[:, None, None], 0.0, inverse)
 
 
 def half_width(
