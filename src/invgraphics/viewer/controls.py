@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from invgraphics.tools.colorize import OUTPUTS
+from invgraphics.core import View
+from invgraphics.tools.colorize import NEEDS_TRUTH, OUTPUTS
+from invgraphics.viewer.cameras import ViewerCamera
+from invgraphics.viewer.crop import CropBox
 from invgraphics.viewer.loaded_run import LoadedRun
-from invgraphics.viewer.progressive import LAYOUTS, ViewerFrame
+from invgraphics.viewer.progressive import LAYOUTS, RenderRequest, ViewerFrame
 
 FREE_CAMERA = "free camera"
 """Entry of the view list for a camera that is at no photograph."""
@@ -88,9 +91,32 @@ class Controls:
         for handle in (self.cameras, self.splats):
             on_change(handle, callbacks.overlays)
 
-    def update_summary(self) -> None:
-        """Update name, training progress and scores of the runs."""
-        self._facts.content = "".join(_facts_of(run) for run in self._runs)
+    def update_summary(self, notice: str = "") -> None:
+        """Update name, training progress and scores of the runs, under a line of text."""
+        above = status_block(escape(notice)) if notice else ""
+        self._facts.content = above + "".join(_facts_of(run) for run in self._runs)
+
+    @property
+    def free_output(self) -> str:
+        """What is shown where there is no photograph: the prediction for outputs that are known at photographs only."""
+        return "prediction" if self.output.value in NEEDS_TRUTH else self.output.value
+
+    def request(
+        self, camera: ViewerCamera, window: tuple[int, int], view: View | None, crop: CropBox | None, skip_coarse: bool
+    ) -> RenderRequest:
+        """What the controls ask to render, at photograph ``view`` or with a free camera; the rest as in `RenderRequest`."""
+        return RenderRequest(
+            camera=camera,
+            window=window,
+            output=self.free_output if view is None else self.output.value,
+            view=view,
+            layout=self.layout.value,
+            split=float(self.split.value),
+            max_size=int(self.max_size.value),
+            skip_coarse=skip_coarse,
+            background=BACKGROUNDS[self.background.value],
+            crop=crop,
+        )
 
     def show_frame(self, frame: ViewerFrame, note: str = "") -> None:
         """Show size, render time, PSNR and legend of a frame."""

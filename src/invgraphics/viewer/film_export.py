@@ -48,8 +48,8 @@ def export_film(
     run: LoadedRun,
     cameras: Sequence[Camera],
     look: FilmLook,
-    on_progress: Callable[[int], None],
-    on_film: Callable[[bytes], None],
+    on_progress: Callable[[str], None],
+    on_film: Callable[[bytes, str], None],
 ) -> Task:
     """Task for the render thread that renders a film, one frame per slice; cancelled, it leaves no file.
 
@@ -57,9 +57,10 @@ def export_film(
         run: what is rendered.
         cameras: in the run's local frame, all of one size.
         look: of the frames.
-        on_progress: called with the number of finished frames.
-        on_film: called with the MP4 file's content.
+        on_progress: called with a line about the progress, once a second of film.
+        on_film: called with the MP4 file's content and a line about it.
     """
+    count = len(cameras)
 
     def render(camera: Camera) -> Rendering:
         return run.render(camera, look.output == "normal", look.crop)
@@ -78,6 +79,8 @@ def export_film(
         with FilmWriter(out, RATE) as writer:
             for index, camera in enumerate(cameras):
                 writer.add(colorize(look.output, [render(camera)], [scene], [None], span).pictures[0])
-                on_progress(index + 1)
+                if index % RATE == 0:
+                    on_progress(f"Exporting: frame {index + 1} of {count}")
                 yield 0.0
-        on_film(out.read_bytes())
+        frames = f"{count} frame{'s' * (count != 1)}"
+        on_film(out.read_bytes(), f"Film of {frames}: the {look.output} of {run.name}. Sent to the browser.")

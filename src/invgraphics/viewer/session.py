@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import numpy as np
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
@@ -16,19 +16,12 @@ from invgraphics.core import Scene
 from invgraphics.experiments.evaluate import display
 from invgraphics.tools.camera_path import CameraPath, Keyframe
 from invgraphics.tools.colorize import NEEDS_TRUTH
-from invgraphics.viewer.camera_move import CameraMove
-from invgraphics.viewer.cameras import (
-    LetterboxedView,
-    ViewerCamera,
-    fov_and_aspect,
-    limit_size,
-    nearest_view_index,
-    rotation_quaternion,
-)
+from invgraphics.viewer.camera_move import CameraMove, send_camera
+from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, fov_and_aspect, limit_size, nearest_view_index
 from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Controls, jump_notice, on_change
 from invgraphics.viewer.crop import crop_note
 from invgraphics.viewer.crop_panel import CropPanel
-from invgraphics.viewer.film_export import RATE, FilmLook, export_film, film_cameras
+from invgraphics.viewer.film_export import FilmLook, export_film, film_cameras
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.overlays import Overlays
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
@@ -64,6 +57,9 @@ class Session:
         self._closed = False
         self._notice = ""
         self._frame: ViewerFrame | None = None
+        self._latest: RenderRequest | None = None
+        self._finished: RenderRequest | None = None
+        self._loop = asyncio.get_running_loop()
         client.camera.on_update(self._camera_changed)
         self.go_to_view(shared.start)
 
@@ -86,25 +82,27 @@ class Session:
         self._request_frame()
 
     def _set_camera(self, pose: Float[Tensor, "4 4"], fov: float) -> None:
-        """Send the browser a camera; it turns around the point ahead that is nearest to the scene's centre."""
-        camera, position, forward = self._client.camera, pose[:3, 3].double(), pose[:3, 2].double()
-        reach = float((self._scene.bounds.centre.double() - position) @ forward)
-        turning = position + forward * (reach if reach > 0 else self._scene.bounds.radius)
-        with self._client.atomic():
-            camera.position = position.numpy()
-            camera.wxyz = np.array(rotation_quaternion(pose))
-            camera.look_at = turning.numpy()
-            camera.fov = fov
-        self._sent_at = camera.update_timestamp
+        self._sent_at = send_camera(self._client, pose, fov, self._scene, self._shared.up)
+
+    def show_held(self) -> None:
+        """Say that a newer checkpoint waits; called by the render thread."""
+        self._controls.update_summary("A newer checkpoint is shown when the film that is being exported is finished.")
 
     def refresh(self) -> None:
         """Show a reloaded model; called by the render thread."""
         self._controls.update_summary()
-        if self._overlays.remove_outdated() and self._view_index is not None:
+        moved = self._overlays.remove_outdated()
+        self._loop.call_soon_threadsafe(self._show_reloaded, moved)  # there reports of cameras arrive
+
+    def _show_reloaded(self, moved: bool) -> None:
+        """Request what the reloaded model shows; at a photograph from its new place if the frame's cameras have ``moved``."""
+        if self._closed:
+            return
+        if moved and self._view_index is not None:
             self.go_to_view(self._view_index)
             return
         self._submit("overlays", self._update_overlays())
-        self._request_frame(skip_coarse=True)
+        self._request_frame(skip_coarse=self._finished is self._latest)
 
     def show_error(self, task: str, sentence: str) -> None:
         """Show the error of a task, "film" or another, as a notification; called by the render thread."""
@@ -112,6 +110,8 @@ class Session:
             return
         if task == "film":
             self._path.show_status("The film could not be made.", exporting=False)
+        elif task == "frame":
+            self._controls.show_status(f"The picture could not be made: {sentence}")
         title = "The film could not be made" if task == "film" else "The picture could not be made"
         self._client.add_notification(title, sentence, color="red")
 
@@ -218,25 +218,20 @@ class Session:
     def _export(self, path: CameraPath) -> None:
         """Render a film of the path in the render thread and send it to the browser."""
         run = self._runs[-1 if self._controls.layout.value == "second" else 0]
-        output, box = self._controls.output.value, self._crop.box
-        output = "prediction" if output in NEEDS_TRUTH else output
+        box = self._crop.box
         box = None if box is None else run.crop_to_local(box, self._scene)
-        look = FilmLook(output, BACKGROUNDS[self._controls.background.value], box)
+        look = FilmLook(self._controls.free_output, BACKGROUNDS[self._controls.background.value], box)
         cameras = film_cameras(path, run, int(self._controls.max_size.value))
-        count = len(cameras)
+        self._submit("film", export_film(run, cameras, look, self._show_film_progress, self._send_film))
 
-        def on_progress(done: int) -> None:
-            if not self._closed and (done == 1 or done % RATE == 0):
-                self._path.show_status(f"Exporting: frame {done} of {count}")
+    def _show_film_progress(self, line: str) -> None:
+        if not self._closed:
+            self._path.show_status(line)
 
-        def on_film(content: bytes) -> None:
-            if not self._closed:
-                self._download(f"{self._scene.name}-path.mp4", content)
-                method = f" of {run.fitted.method.name}" if len(self._runs) > 1 else ""
-                frames = f"{count} frame{'s' * (count != 1)}"
-                self._path.show_status(f"Film of {frames}: the {output}{method}. Sent to the browser.", exporting=False)
-
-        self._submit("film", export_film(run, cameras, look, on_progress, on_film))
+    def _send_film(self, content: bytes, line: str) -> None:
+        if not self._closed:
+            self._download(f"{self._scene.name}-path.mp4", content)
+            self._path.show_status(line, exporting=False)
 
     def _stop_export(self) -> None:
         self._shared.thread.cancel(("film", self._client.client_id))
@@ -252,22 +247,11 @@ class Session:
             self._submit("frame", self._clear_background())
             return
         output = controls.output.value
-        request = RenderRequest(
-            camera=self._camera,
-            window=self._window,
-            output="prediction" if view_index is None and output in NEEDS_TRUTH else output,
-            view=None if view_index is None else self._shared.views[view_index][1],
-            layout=controls.layout.value,
-            split=float(controls.split.value),
-            max_size=int(controls.max_size.value),
-            skip_coarse=skip_coarse,
-            background=BACKGROUNDS[controls.background.value],
-            crop=self._crop.box,
-        )
+        view = None if view_index is None else self._shared.views[view_index][1]
+        request = self._latest = controls.request(self._camera, self._window, view, self._crop.box, skip_coarse)
         note = (
             self._notice if request.output == output else f"This is the prediction: the {output} is known at photographs only."
         )
-
         if request.crop is not None:
             runs = {"first": self._runs[:1], "second": self._runs[-1:]}.get(request.layout, self._runs)
             note = " ".join(filter(None, (note, *dict.fromkeys(crop_note(run.fitted.model.renderer) for run in runs))))
@@ -276,6 +260,7 @@ class Session:
             if self._closed:
                 return
             self._frame = frame
+            self._finished = request if frame.final else self._finished
             self._client.scene.set_background_image(frame.image, format="png" if frame.final else "jpeg")
             controls.show_frame(frame, note)
 

@@ -20,6 +20,7 @@ class SharedState:
         frustums: overlays of `views`.
         start: index of the initial view.
         max_size: initial limit of the longer side, pixels.
+        up: up direction of the orbit controls, in the first run's local frame.
     """
 
     renderer: ProgressiveRenderer
@@ -27,6 +28,7 @@ class SharedState:
     frustums: CameraFrustums
     start: int
     max_size: int
+    up: tuple[float, float, float]
 
     @property
     def views(self) -> list[tuple[str, View]]:
