@@ -10,10 +10,10 @@ import torch
 
 pytest.importorskip("viser")
 
-from browser_messages import connect, report, session_of, until  # noqa: E402
+from browser_messages import connect, report, session_of, until
 
-from invgraphics.viewer.launch import ViewerConfig, open_viewer  # noqa: E402
-from invgraphics.viewer.server import Viewer  # noqa: E402
+from invgraphics.viewer.launch import ViewerConfig, open_viewer
+from invgraphics.viewer.server import Viewer
 
 
 @pytest.fixture

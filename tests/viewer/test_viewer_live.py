@@ -1,4 +1,4 @@
-"""Checkpoints that come while a picture or a film of an earlier one is made, and errors of pictures: browsers by messages alone."""
+"""Checkpoints during a picture or a film of an earlier one, and errors of pictures: browsers by their messages alone."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pytest
 
 pytest.importorskip("viser")
 
-from browser_messages import connect, report, session_of, until  # noqa: E402
+from browser_messages import connect, report, session_of, until
 
-from invgraphics.tools.camera_path import CameraPath, Keyframe  # noqa: E402
-from invgraphics.viewer.launch import ViewerConfig, open_viewer  # noqa: E402
-from invgraphics.viewer.loaded_run import LoadedRun  # noqa: E402
-from invgraphics.viewer.server import Viewer  # noqa: E402
+from invgraphics.tools.camera_path import CameraPath, Keyframe
+from invgraphics.viewer.launch import ViewerConfig, open_viewer
+from invgraphics.viewer.loaded_run import LoadedRun
+from invgraphics.viewer.server import Viewer
 
 
 @pytest.fixture
