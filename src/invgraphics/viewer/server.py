@@ -48,10 +48,12 @@ class Address:
     Attributes:
         host: address to listen at; a loopback address is reachable from this machine only.
         port: port, 0 for any that is free.
+        allowed: further names at which browsers reach it, see `HostCheck.allowed`.
     """
 
     host: str
     port: int
+    allowed: tuple[str, ...] = ()
 
 
 class Viewer:
@@ -75,7 +77,7 @@ class Viewer:
         self._shared = SharedState(ProgressiveRenderer(runs), self._worker, frustums, view, max_size, upward(scene))
         self._sessions: dict[int, Session] = {}
         self._reloading = False
-        check = HostCheck(address.host)
+        check = HostCheck(address.host, address.allowed)
         with redirect_stdout(io.StringIO()), check.applied():  # the command prints the address itself
             self._server = LocalServer(address.host, address.port, label=" | ".join(s.name for s in runs), verbose=False)
         if address.port and self._server.get_port() != address.port:  # viser falls back to the next port
