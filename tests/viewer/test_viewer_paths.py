@@ -1,13 +1,17 @@
 """Camera paths while they play, and errors of films, without a browser."""
 
 import asyncio
+from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 import torch
 
+from invgraphics.core import Scene
 from invgraphics.testing import toy_scene
 from invgraphics.tools.camera_path import Keyframe
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
@@ -48,7 +52,7 @@ class Page:
         return Control()
 
 
-def panel(moves: list[Keyframe]) -> PathPanel:
+def panel(moves: list[Keyframe], scene: Callable[[], Scene] | None = None) -> PathPanel:
     places = iter(range(1, 10))
 
     def current() -> Keyframe:
@@ -57,8 +61,12 @@ def panel(moves: list[Keyframe]) -> PathPanel:
         return Keyframe(pose, 1.0)
 
     callbacks = PathCallbacks(current, moves.append, lambda path: None, lambda: None, lambda name, content: None)
-    drawn = SimpleNamespace(add_line_segments=lambda *_, **__: SimpleNamespace(visible=True, remove=lambda: None))
-    return PathPanel(Page(), drawn, toy_scene(views=2, size=4), callbacks)
+
+    def add_line_segments(name: str, points: Any, *_: Any, **__: Any) -> Any:
+        return SimpleNamespace(visible=True, remove=lambda: None, points=points)
+
+    toy = toy_scene(views=2, size=4)
+    return PathPanel(Page(), SimpleNamespace(add_line_segments=add_line_segments), scene or (lambda: toy), callbacks)
 
 
 @pytest.mark.parametrize("loop", [False, True])
@@ -91,6 +99,42 @@ def test_the_selected_keyframe_can_be_returned_to() -> None:
     asyncio.run(path._add())
     asyncio.run(path._return())
     assert [float(keyframe.pose[0, 3]) for keyframe in moves] == [1.0]
+
+
+def test_the_drawn_path_is_hidden_while_it_plays_and_on_demand() -> None:
+    async def play() -> None:
+        path = panel([])
+        for _ in range(2):
+            await path._add()
+        assert path._line.visible
+        await path._toggle_play()
+        assert not path._line.visible
+        await path._retime()
+        assert not path._line.visible, "another line, of the same path"
+        path.show_line(False)
+        await path._toggle_play()
+        assert not path._line.visible
+        await path._add()
+        assert not path._line.visible
+        path.show_line(True)
+        assert path._line.visible
+
+    asyncio.run(play())
+
+
+def test_the_path_is_drawn_where_the_frame_has_it_now() -> None:
+    """Keyframes are in the world: in a frame of half the scale, moved by (1, 2, 3), they are elsewhere."""
+    scenes = [toy_scene(views=2, size=4)]
+    path = panel([], lambda: scenes[-1])
+    for _ in range(2):
+        asyncio.run(path._add())
+    np.testing.assert_allclose(path._line.points[0, 0], [1, 0, 0], atol=1e-6)
+    similarity = torch.diag(torch.tensor([0.5, 0.5, 0.5, 1.0]))
+    similarity[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    scenes.append(replace(scenes[0], world_from_local=similarity))
+    path.draw()
+    np.testing.assert_allclose(path._line.points[0, 0], [0, -4, -6], atol=1e-6)
+    np.testing.assert_allclose(path._line.points[-1, 1], [2, -4, -6], atol=1e-6)
 
 
 def test_an_error_is_shown_to_whom_it_concerns(capsys: pytest.CaptureFixture[str]) -> None:

@@ -97,6 +97,11 @@ class Controls:
         self._facts.content = above + "".join(_facts_of(run) for run in self._runs)
 
     @property
+    def one_camera(self) -> bool:
+        """Whether the whole window shows one camera, so that what the browser draws fits the picture."""
+        return self.layout.value != "side by side"
+
+    @property
     def free_output(self) -> str:
         """What is shown where there is no photograph: the prediction for outputs that are known at photographs only."""
         return "prediction" if self.output.value in NEEDS_TRUTH else self.output.value

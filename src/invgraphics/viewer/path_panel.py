@@ -52,17 +52,18 @@ class PathPanel:
     Args:
         gui: viser's interface of a browser.
         viser_scene: where the path is drawn.
-        scene: of the first run.
+        scene: gives that of the first run, whose frame may change with its checkpoint.
         callbacks: of the session.
     """
 
-    def __init__(self, gui: Any, viser_scene: Any, scene: Scene, callbacks: PathCallbacks) -> None:
+    def __init__(self, gui: Any, viser_scene: Any, scene: Callable[[], Scene], callbacks: PathCallbacks) -> None:
         self._viser_scene, self._scene, self._callbacks = viser_scene, scene, callbacks
         self.path = CameraPath(())
         self._playing: asyncio.Task[None] | None = None
         self._exporting = False
         self._listed, self._listed_at = NONE, 0.0
         self._line: Any = None
+        self._line_shown = True
         with gui.add_folder("Camera path", expand_by_default=False):
             add = gui.add_button("Add keyframe", hint="The current view, after the keyframe that is selected below.")
             self.selected = gui.add_dropdown("Keyframe", (NONE,), hint="Selecting another one goes there.")
@@ -95,6 +96,12 @@ class PathPanel:
         if exporting is not None:
             self._exporting = exporting
             self._export.label = "Stop export" if exporting else "Export film"
+
+    def show_line(self, shown: bool) -> None:
+        """Show or hide the drawn path; while it plays it is hidden."""
+        self._line_shown = shown
+        if self._line is not None:
+            self._line.visible = shown and self._playing is None
 
     def close(self) -> None:
         """Stop playing."""
@@ -144,16 +151,22 @@ class PathPanel:
         if self._playing is not None and len(self.path.keyframes) < 2:
             self.close()
             self._stopped()
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw the path where the scene's frame has it now."""
         if self._line is not None:
             self._line.remove()
             self._line = None
         if len(self.path.keyframes) > 1:
+            scene = self._scene()
             times = np.linspace(0, self.path.duration, SAMPLES * len(self.path.keyframes))
-            places = np.stack([one.local_pose(self._scene)[:3, 3].numpy() for one in self.path.at(times)])
+            places = np.stack([one.local_pose(scene)[:3, 3].numpy() for one in self.path.at(times)])
             segments = np.stack([places[:-1], places[1:]], axis=1)
             self._line = self._viser_scene.add_line_segments(
                 "/camera-path", segments, LINE, thickness=2.0, thickness_units="screen"
             )
+            self.show_line(self._line_shown)
 
     async def _toggle_play(self) -> None:
         if self._playing is not None:
@@ -163,9 +176,8 @@ class PathPanel:
             self.show_status("Playing needs two keyframes.")
         else:
             self._play.label = "Stop"
-            if self._line is not None:
-                self._line.visible = False
             self._playing = asyncio.get_running_loop().create_task(self._run())
+            self.show_line(self._line_shown)
 
     async def _run(self) -> None:
         began = time.monotonic()
@@ -178,12 +190,11 @@ class PathPanel:
 
     def _stopped(self) -> None:
         self._play.label = "Play"
-        if self._line is not None:
-            self._line.visible = True
+        self.show_line(self._line_shown)
 
     async def _save(self) -> None:
         if self.path.keyframes:
-            self._callbacks.download(f"{self._scene.name}-path.json", self.path.to_json().encode())
+            self._callbacks.download(f"{self._scene().name}-path.json", self.path.to_json().encode())
         else:
             self.show_status("Saving needs a keyframe.")
 

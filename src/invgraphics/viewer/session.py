@@ -44,11 +44,11 @@ class Session:
         names = [name for name, _ in shared.views]
         callbacks = Callbacks(self._output_changed, self._view_chosen, self._overlays_changed, self._save_image)
         self._controls = Controls(client.gui, shared.renderer.runs, names, shared.max_size, callbacks)
-        self._crop = CropPanel(client.gui, client.scene, self._scene)
+        self._crop = CropPanel(client.gui, client.scene, lambda: self._scene)
         for handle in (self._crop.enabled, *self._crop.axes):
             on_change(handle, self._crop_changed)
         path = PathCallbacks(self._keyframe, self._move_to, self._export, self._stop_export, self._download)
-        self._path = PathPanel(client.gui, client.scene, self._scene, path)
+        self._path = PathPanel(client.gui, client.scene, lambda: self._scene, path)
         self._view_index: int | None = None
         self._move: CameraMove | None = None
         self._requested: tuple[int | None, float] | None = None
@@ -98,6 +98,9 @@ class Session:
         """Request what the reloaded model shows; at a photograph from its new place if the frame's cameras have ``moved``."""
         if self._closed:
             return
+        if moved:
+            self._crop.draw()
+            self._path.draw()
         if moved and self._view_index is not None:
             self.go_to_view(self._view_index)
             return
@@ -168,6 +171,8 @@ class Session:
         self._request_frame()
 
     async def _output_changed(self) -> None:
+        self._crop.show_outline(self._controls.one_camera)
+        self._path.show_line(self._controls.one_camera)
         if self._controls.output.value in NEEDS_TRUTH and self._view_index is None:
             index = nearest_view_index([view for _, view in self._shared.views], self._camera, self._scene.extent)
             self._notice = jump_notice(self._controls.output.value, self._shared.views[index][0])
@@ -188,7 +193,7 @@ class Session:
             self._controls.show_status("Nothing to save: splats are drawn by the browser. Switch that off first.")
             return
         content = io.BytesIO()
-        Image.fromarray(self._frame.image).save(content, format="PNG")
+        Image.fromarray(self._frame.picture).save(content, format="PNG")
         self._download(f"{self._scene.name}-{self._frame.output}.png", content.getvalue())
 
     def _download(self, name: str, content: bytes) -> None:
@@ -277,7 +282,7 @@ class Session:
     def _update_overlays(self) -> Iterator[float]:
         """Bring the overlays in line with the controls; runs in the render thread."""
         controls = self._controls
-        frustums = controls.cameras.value and controls.layout.value != "side by side"
+        frustums = controls.cameras.value and controls.one_camera
         yield from self._overlays.update(controls.splats.value, frustums, self._view_index)
 
     async def _frustum_clicked(self, index: int) -> None:
