@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Coroutine, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,18 +17,31 @@ pytest.importorskip("viser")
 from browser_messages import connect, report, session_of, until
 
 from invgraphics.viewer.launch import ViewerConfig, open_viewer
+from invgraphics.viewer.server import Viewer
 from invgraphics.viewer.session import Session
 
 PAIR = ("volumetric/hash", "splatting/gaussians")
 
 
 @pytest.fixture
-def session(runs: dict[str, Path]) -> Iterator[Session]:
-    """Of two runs, whose first picture is there."""
-    with open_viewer(ViewerConfig(tuple(runs[one] for one in PAIR), port=0), print) as viewer, connect(viewer) as socket:
-        report(socket, 700, viewer._runs[0].scene.test[0].camera.cam_to_world)
-        found = session_of(viewer, 700)
+def viewer(runs: dict[str, Path]) -> Iterator[Viewer]:
+    with open_viewer(ViewerConfig(tuple(runs[one] for one in PAIR), port=0), print) as opened:
+        yield opened
+
+
+@contextmanager
+def browser(viewer: Viewer, width: int = 700) -> Iterator[Session]:
+    """The session of a browser with a window of this width, whose first picture is there."""
+    with connect(viewer) as socket:
+        report(socket, width, viewer._runs[0].scene.test[0].camera.cam_to_world)
+        found = session_of(viewer, width)
         until(lambda: found._frame)
+        yield found
+
+
+@pytest.fixture
+def session(viewer: Viewer) -> Iterator[Session]:
+    with browser(viewer) as found:
         yield found
 
 
@@ -57,3 +71,19 @@ def test_the_crop_box_is_that_of_the_frame_as_it_is_now(session: Session) -> Non
     similarity = run.scene.world_from_local @ torch.diag(torch.tensor([0.5, 0.5, 0.5, 1.0]))
     run.fitted = replace(run.fitted, scene=replace(run.scene, world_from_local=similarity))
     assert session._crop.box.hi == pytest.approx([2 * value for value in before.hi])
+
+
+def test_a_browser_that_connects_again_has_the_last_path(viewer: Viewer, session: Session) -> None:
+    for _ in range(3):
+        do(session, session._path._add())
+    session._path.loop.value = True
+    do(session, session._path._reloop())
+    do(session, session._path._delete())
+    with browser(viewer, 701) as again:
+        assert again is not session
+        assert again._path.path is session._path.path
+        assert len(again._path.path.keyframes) == 2 and again._path.loop.value and again._path.selected.value == "2 of 2"
+        assert again._path._line is not None
+        do(again, again._path._delete())
+        with browser(viewer, 702) as third:
+            assert len(third._path.path.keyframes) == 1

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from invgraphics.core import Scene
-from invgraphics.tools.camera_path import CameraPath, Keyframe, with_keyframe, without
+from invgraphics.errors import InputError
+from invgraphics.tools.camera_path import CameraPath, Keyframe, parse_camera_path, with_keyframe, without
 from invgraphics.viewer.controls import status_block
 
 NONE = "none yet"
@@ -23,6 +24,8 @@ ECHO = 0.5
 """Seconds after a change of the list within which selections are the browser's echoes of it."""
 SAMPLES = 24
 """Segments of the drawn path between two keyframes."""
+SECONDS = 0.2, 10.0
+"""Range of the time between keyframes that can be set; a file may have another."""
 LINE = (0, 158, 115)
 FILM = "An MP4 file at full size: of one run, the second where that is shown alone, and of its prediction for truth and error."
 
@@ -37,6 +40,7 @@ class PathCallbacks:
         export: starts the export of a film; progress is shown with `PathPanel.show_status`.
         stop_export: cancels it.
         download: sends a file to the browser.
+        changed: takes the path after each change.
     """
 
     current: Callable[[], Keyframe]
@@ -44,6 +48,7 @@ class PathCallbacks:
     export: Callable[[CameraPath], None]
     stop_export: Callable[[], None]
     download: Callable[[str, bytes], None]
+    changed: Callable[[CameraPath], None]
 
 
 class PathPanel:
@@ -53,12 +58,15 @@ class PathPanel:
         gui: viser's interface of a browser.
         viser_scene: where the path is drawn.
         scene: gives that of the first run, whose frame may change with its checkpoint.
+        path: to begin with.
         callbacks: of the session.
     """
 
-    def __init__(self, gui: Any, viser_scene: Any, scene: Callable[[], Scene], callbacks: PathCallbacks) -> None:
+    def __init__(
+        self, gui: Any, viser_scene: Any, scene: Callable[[], Scene], path: CameraPath, callbacks: PathCallbacks
+    ) -> None:
         self._viser_scene, self._scene, self._callbacks = viser_scene, scene, callbacks
-        self.path = CameraPath(())
+        self.path = path
         self._playing: asyncio.Task[None] | None = None
         self._exporting = False
         self._listed, self._listed_at = NONE, 0.0
@@ -69,10 +77,11 @@ class PathPanel:
             self.selected = gui.add_dropdown("Keyframe", (NONE,), hint="Selecting another one goes there.")
             back = gui.add_button("Go to keyframe", hint="The selected one.")
             delete = gui.add_button("Delete keyframe")
-            self.seconds = gui.add_slider("Seconds between", 0.2, 10.0, 0.1, self.path.seconds)
+            self.seconds = gui.add_slider("Seconds between", *SECONDS, 0.1, CameraPath(()).seconds)
             self.loop = gui.add_checkbox("Loop", False, hint="Returns to the first keyframe.")
             self._play = gui.add_button("Play")
             save = gui.add_button("Save path", hint="A JSON file, for `invgraphics render RUN --path FILE.json`.")
+            self._upload = gui.add_upload_button("Load path", hint="A file of Save path.", mime_type="application/json")
             self._export = gui.add_button("Export film", hint=FILM)
             self._status = gui.add_html("")
         for button, handler in (
@@ -84,9 +93,10 @@ class PathPanel:
             (self._export, self._toggle_export),
         ):
             button.on_click(_ignoring_event(handler))
-        for handle, handler in ((self.selected, self._go), (self.seconds, self._retime), (self.loop, self._retime)):
+        self._upload.on_upload(_ignoring_event(self._load))
+        for handle, handler in ((self.selected, self._go), (self.seconds, self._retime), (self.loop, self._reloop)):
             handle.on_update(_by_user(handler))
-        self.show_status("")
+        self._take(path)
 
     def show_status(self, line: str, exporting: bool | None = None) -> None:
         """Show the path's length and a line of text; ``exporting`` switches the export button."""
@@ -142,12 +152,33 @@ class PathPanel:
             self._callbacks.move(self.path.keyframes[index])
 
     async def _retime(self) -> None:
-        self.path = replace(self.path, seconds=float(self.seconds.value), loop=bool(self.loop.value))
+        self.path = replace(self.path, seconds=float(self.seconds.value))
         self._changed()
 
+    async def _reloop(self) -> None:
+        self.path = replace(self.path, loop=bool(self.loop.value))
+        self._changed()
+
+    async def _load(self) -> None:
+        file = self._upload.value
+        try:
+            path = parse_camera_path(file.content, file.name)
+        except InputError as error:
+            self.show_status(error.sentence)
+            return
+        self._take(path)
+        self.show_status(f"Loaded {file.name}.")
+
+    def _take(self, path: CameraPath) -> None:
+        """Edit ``path`` from now on, its last keyframe selected."""
+        self.path = path
+        self.seconds.value, self.loop.value = min(max(path.seconds, SECONDS[0]), SECONDS[1]), path.loop
+        self._list(len(path.keyframes) - 1)
+
     def _changed(self) -> None:
-        """Update status and drawing; a path that plays goes on with its next camera, or stops where it has become too short."""
+        """Update status and drawing, hand the path on, and stop one that plays and has become too short."""
         self.show_status("")
+        self._callbacks.changed(self.path)
         if self._playing is not None and len(self.path.keyframes) < 2:
             self.close()
             self._stopped()

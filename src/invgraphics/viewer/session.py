@@ -47,8 +47,8 @@ class Session:
         self._crop = CropPanel(client.gui, client.scene, lambda: self._scene)
         for handle in (self._crop.enabled, *self._crop.axes):
             on_change(handle, self._crop_changed)
-        path = PathCallbacks(self._keyframe, self._move_to, self._export, self._stop_export, self._download)
-        self._path = PathPanel(client.gui, client.scene, lambda: self._scene, path)
+        path = PathCallbacks(self._keyframe, self._move_to, self._export, self._stop_export, self._download, self._keep)
+        self._path = PathPanel(client.gui, client.scene, lambda: self._scene, shared.path, path)
         self._view_index: int | None = None
         self._move: CameraMove | None = None
         self._requested: tuple[int | None, float] | None = None
@@ -237,6 +237,9 @@ class Session:
         if not self._closed:
             self._download(f"{self._scene.name}-path.mp4", content)
             self._path.show_status(line, exporting=False)
+
+    def _keep(self, path: CameraPath) -> None:
+        self._shared.path = path
 
     def _stop_export(self) -> None:
         self._shared.thread.cancel(("film", self._client.client_id))
