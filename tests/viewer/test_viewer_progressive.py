@@ -247,7 +247,7 @@ def test_cameras_follow_refined_poses(balls: Path, tmp_path: Path) -> None:
     run = fit_run(FitRequest(method=method, scene=str(balls), out=str(tmp_path / "run"), budget="3steps", overrides=overrides))
     loaded, drawn = LoadedRun(open_fitted(run)), []
     overlays = Overlays(_Drawn(drawn), loaded, CameraFrustums(loaded), lambda index: None)
-    list(overlays.update(splats=False, frustums=True, hidden=None))
+    list(overlays.update(splats=None, frustums=True, hidden=None))
     assert len(drawn) == len(loaded.views())
     assert not overlays.remove_outdated()
     before = torch.stack([view.camera.position for view in loaded.scene.train])
@@ -262,7 +262,7 @@ def test_cameras_follow_refined_poses(balls: Path, tmp_path: Path) -> None:
     assert float((after - before).norm(dim=1).max()) > 0.1
     assert torch.equal(after, fresh)
     assert overlays.remove_outdated()
-    list(overlays.update(splats=False, frustums=True, hidden=None))
+    list(overlays.update(splats=None, frustums=True, hidden=None))
     assert len(drawn) == 2 * len(loaded.views())
     assert sum(handle.gone for handle in drawn) == len(loaded.views())
     torch.testing.assert_close(torch.tensor(drawn[-1].position), after[-1])

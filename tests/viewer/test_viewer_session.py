@@ -7,8 +7,10 @@ from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,7 +18,10 @@ pytest.importorskip("viser")
 
 from browser_messages import connect, report, session_of, until
 
+from invgraphics.experiments.fitted import open_fitted
 from invgraphics.viewer.launch import ViewerConfig, open_viewer
+from invgraphics.viewer.loaded_run import LoadedRun
+from invgraphics.viewer.overlays import add_splats
 from invgraphics.viewer.server import Viewer
 from invgraphics.viewer.session import Session
 
@@ -87,3 +92,49 @@ def test_a_browser_that_connects_again_has_the_last_path(viewer: Viewer, session
         do(again, again._path._delete())
         with browser(viewer, 702) as third:
             assert len(third._path.path.keyframes) == 1
+
+
+def test_splats_of_the_browser_are_those_of_the_run_that_is_shown(
+    viewer: Viewer, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first run of the pair has none; where both have some, the second's are drawn if it is shown alone."""
+    hash_grid, gaussians = viewer._runs
+    controls, status, images = session._controls, session._controls._status, []
+    assert controls.splats.visible
+    monkeypatch.setattr(session._client.scene, "set_background_image", lambda image, **_: images.append(image))
+    controls.layout.value, controls.splats.value = "first", True
+    do(session, session._overlays_changed())
+    until(lambda: session._overlays._splats.get(gaussians))
+    until(lambda: "These are the splats of splatting/gaussians." in status.content or None)
+    assert "Without effect on them: Runs." in status.content
+    controls.layout.value, controls.background.value, session._crop.enabled.value = "second", "black", True
+    controls.output.value = "depth"
+    do(session, session._output_changed())
+    until(lambda: "Without effect on them: Show, Crop." in status.content or None)
+    assert images[-1].max() == 0
+    monkeypatch.setattr(type(hash_grid), "has_gaussians", True)
+    assert controls.splat_run is gaussians
+    controls.layout.value = "split"
+    assert controls.splat_run is hash_grid
+    controls.splats.value = False
+    assert controls.splat_run is None
+
+
+def test_splats_of_a_run_in_another_frame_are_drawn_in_the_first_ones(runs: dict[str, Path]) -> None:
+    """Centres c become M c + t, covariances M S M^T."""
+    run = LoadedRun(open_fitted(runs["splatting/gaussians"]))
+    similarity = torch.tensor([[0.0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, -1], [0, 0, 0, 1.0]])
+    scene = replace(run.scene, world_from_local=similarity)
+    drawn: list[dict[str, Any]] = []
+    page: Any = SimpleNamespace(add_gaussian_splats=lambda name, **settings: drawn.append(settings))
+    add_splats(run, page, "/own", run.scene)
+    add_splats(run, page, "/other", scene)
+    own, other = drawn
+    inverse = np.linalg.inv(similarity.double().numpy())
+    world = run.scene.world_from_local.double().numpy()
+    to = inverse @ world
+    centres = own["centers"] * own["scale"] @ to[:3, :3].T + to[:3, 3]
+    np.testing.assert_allclose(other["centers"] * other["scale"], centres, atol=1e-4)
+    covariances = to[:3, :3] @ (own["covariances"] * own["scale"] ** 2) @ to[:3, :3].T
+    np.testing.assert_allclose(other["covariances"] * other["scale"] ** 2, covariances, atol=1e-3 * np.abs(covariances).max())
+    np.testing.assert_allclose(other["rgbs"], own["rgbs"], atol=1e-5)

@@ -69,7 +69,7 @@ class Controls:
         self.splats = gui.add_checkbox(
             "Splats drawn by the browser",
             False,
-            visible=runs[0].has_gaussians,
+            visible=any(run.has_gaussians for run in runs),
             hint="Smooth while moving. Colours without view dependence; the run's own renderer is not used.",
         )
         top = max(LARGEST, max_size)
@@ -100,6 +100,25 @@ class Controls:
     def one_camera(self) -> bool:
         """Whether the whole window shows one camera, so that what the browser draws fits the picture."""
         return self.layout.value != "side by side"
+
+    @property
+    def splat_run(self) -> LoadedRun | None:
+        """The run whose splats the browser draws: the second if that is shown alone, and the other one if it has none."""
+        if not self.splats.value:
+            return None
+        wanted = self._runs[::-1] if self.layout.value == "second" else self._runs
+        return next((run for run in wanted if run.has_gaussians), None)
+
+    def show_splat_status(self, run: LoadedRun, cropped: bool) -> None:
+        """Show whose splats the browser draws, and which controls have no effect on them."""
+        alone = {"first": self._runs[0], "second": self._runs[-1]}.get(self.layout.value)
+        idle = {"Show": self.output.value != "prediction", "Crop": cropped, "Runs": len(self._runs) > 1 and run is not alone}
+        names = ", ".join(name for name, without_effect in idle.items() if without_effect)
+        self.show_status(
+            "Drawn by the browser: colours without view dependence.",
+            f"These are the splats of {run.name}." if len(self._runs) > 1 else "",
+            f"Without effect on them: {names}." if names else "",
+        )
 
     @property
     def free_output(self) -> str:

@@ -13,7 +13,6 @@ from PIL import Image
 from torch import Tensor
 
 from invgraphics.core import Scene
-from invgraphics.experiments.evaluate import display
 from invgraphics.tools.camera_path import CameraPath, Keyframe
 from invgraphics.tools.colorize import NEEDS_TRUTH
 from invgraphics.viewer.camera_move import CameraMove, send_camera
@@ -23,7 +22,7 @@ from invgraphics.viewer.crop import crop_note
 from invgraphics.viewer.crop_panel import CropPanel
 from invgraphics.viewer.film_export import FilmLook, export_film, film_cameras
 from invgraphics.viewer.loaded_run import LoadedRun
-from invgraphics.viewer.overlays import Overlays
+from invgraphics.viewer.overlays import Overlays, plain_background
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
 from invgraphics.viewer.progressive import RenderRequest, ViewerFrame
 from invgraphics.viewer.render_thread import Task
@@ -251,8 +250,8 @@ class Session:
         """Submit a render request for the current camera and controls."""
         controls, view_index = self._controls, self._view_index
         self._requested = self._letterboxed
-        if controls.splats.value:
-            self._submit("frame", self._clear_background())
+        if controls.splat_run is not None:
+            self._submit("frame", self._clear_background(controls.splat_run))
             return
         output = controls.output.value
         view = None if view_index is None else self._shared.views[view_index][1]
@@ -274,19 +273,19 @@ class Session:
 
         self._submit("frame", self._shared.renderer.render(request, on_frame))
 
-    def _clear_background(self) -> Task:
-        """Clear the image to the scene's background, behind splats drawn by the browser."""
+    def _clear_background(self, run: LoadedRun) -> Task:
+        """Clear the image to the chosen background, behind a run's splats drawn by the browser."""
         self._frame = None
-        plain = display(self._scene.background.expand(2, 2, 3), self._scene)
-        self._client.scene.set_background_image(plain.numpy(), format="png")
-        self._controls.show_status("Drawn by the browser: colours without view dependence.")
+        plain = plain_background(self._scene, BACKGROUNDS[self._controls.background.value])
+        self._client.scene.set_background_image(plain, format="png")
+        self._controls.show_splat_status(run, self._crop.box is not None)
         yield 0.0
 
     def _update_overlays(self) -> Iterator[float]:
         """Bring the overlays in line with the controls; runs in the render thread."""
         controls = self._controls
         frustums = controls.cameras.value and controls.one_camera
-        yield from self._overlays.update(controls.splats.value, frustums, self._view_index)
+        yield from self._overlays.update(controls.splat_run, frustums, self._view_index)
 
     async def _frustum_clicked(self, index: int) -> None:
         self.go_to_view(index)
