@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -10,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -19,6 +21,8 @@ pytest.importorskip("viser")
 from browser_messages import connect, report, session_of, until
 
 from invgraphics.experiments.fitted import open_fitted
+from invgraphics.tools.camera_path import Keyframe
+from invgraphics.viewer.controls import FOVS, FREE_CAMERA
 from invgraphics.viewer.launch import ViewerConfig, open_viewer
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.overlays import add_splats
@@ -138,3 +142,49 @@ def test_splats_of_a_run_in_another_frame_are_drawn_in_the_first_ones(runs: dict
     covariances = to[:3, :3] @ (own["covariances"] * own["scale"] ** 2) @ to[:3, :3].T
     np.testing.assert_allclose(other["covariances"] * other["scale"] ** 2, covariances, atol=1e-3 * np.abs(covariances).max())
     np.testing.assert_allclose(other["rgbs"], own["rgbs"], atol=1e-5)
+
+
+def test_the_field_of_view_is_chosen_and_shown(viewer: Viewer, session: Session) -> None:
+    """At a photograph it is the letterbox's; choosing another one frees the camera where it stands."""
+    pose = viewer._runs[0].scene.test[0].camera.cam_to_world
+    shown = math.degrees(session._client.camera.fov)
+    assert session._controls.fov.value == round(shown)
+    session._controls.fov.value = 20
+    do(session, session._fov_changed())
+    assert (session._view_index, session._controls.view.value) == (None, FREE_CAMERA)
+    assert session._client.camera.fov == pytest.approx(math.radians(20))
+    camera = session._latest.camera
+    assert camera.fov == pytest.approx(math.radians(20)) and camera.is_at(pose, 1e-4, 1e-3) and session._latest.view is None
+    session._move_to(Keyframe.from_local(pose, math.radians(33.2), session._scene))
+    assert session._controls.fov.value == 33
+    session._move_to(Keyframe.from_local(pose, math.radians(1), session._scene))
+    assert session._controls.fov.value == FOVS[0] and session._client.camera.fov == pytest.approx(math.radians(1))
+
+
+@pytest.mark.parametrize(
+    ("shape", "rate", "most", "size", "count"), [("photograph", 24, 96, (32, 32), 13), ("window", 10, 70, (70, 50), 6)]
+)
+def test_films_have_the_chosen_shape_and_rate(
+    session: Session,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    shape: str,
+    rate: int,
+    most: int,
+    size: object,
+    count: int,
+) -> None:
+    """Half a second, read back by ffmpeg; the window has 700 x 500 pixels."""
+    films: list[bytes] = []
+    monkeypatch.setattr(session, "_download", lambda name, content: films.append(content))
+    path = session._path
+    for _ in range(2):
+        do(session, path._add())
+    path.shape.value, path.rate.value, path.seconds.value, session._controls.max_size.value = shape, rate, 0.5, most
+    do(session, path._retime())
+    session._export(path.path)
+    until(lambda: films or None)
+    (tmp_path / "film.mp4").write_bytes(films[0])
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4"))
+    facts = next(reader)
+    assert (facts["size"], facts["fps"], sum(1 for _ in reader)) == (size, rate, count)

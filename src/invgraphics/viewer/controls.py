@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -19,6 +20,9 @@ FREE_CAMERA = "free camera"
 SMALLEST, LARGEST = 64, 2048
 """Range of the resolution limit, pixels along the longer side."""
 
+FOVS = 5, 120
+"""Range of the field of view, degrees."""
+
 BACKGROUNDS = {"the scene's": None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 """Name -> colour behind predictions; scores keep the scene's own."""
 
@@ -34,12 +38,14 @@ class Callbacks:
         view: a photograph was chosen.
         overlays: what the browser draws itself has changed.
         save: the current image is wanted as a file.
+        fov: another field of view was chosen.
     """
 
     output: Callback
     view: Callback
     overlays: Callback
     save: Callback
+    fov: Callback
 
 
 class Controls:
@@ -59,6 +65,13 @@ class Controls:
             "Show", OUTPUTS, hint="Truth and error are known at photographs only; choosing them goes to the nearest one."
         )
         self.view = gui.add_dropdown("View", (FREE_CAMERA, *views), hint="Puts the camera where a photograph was taken.")
+        self.fov = gui.add_slider(
+            "Field of view",
+            *FOVS,
+            1,
+            50,
+            hint="From top to bottom, in degrees. At a photograph it is the photograph's: others leave it.",
+        )
         several = len(runs) > 1
         self.layout = gui.add_dropdown("Runs", LAYOUTS if several else ("first",), visible=several)
         self.split = gui.add_slider("Split at", 0.0, 1.0, 0.01, 0.5, visible=several)
@@ -88,6 +101,7 @@ class Controls:
 
         save.on_click(saved)
         on_change(self.view, callbacks.view)
+        on_change(self.fov, callbacks.fov)
         for handle in (self.cameras, self.splats):
             on_change(handle, callbacks.overlays)
 
@@ -95,6 +109,12 @@ class Controls:
         """Update name, training progress and scores of the runs, under a line of text."""
         above = status_block(escape(notice)) if notice else ""
         self._facts.content = above + "".join(_facts_of(run) for run in self._runs)
+
+    def show_fov(self, radians: float) -> None:
+        """Show a vertical field of view; one beyond the slider's range at its end."""
+        degrees = min(max(round(math.degrees(radians)), FOVS[0]), FOVS[1])
+        if degrees != self.fov.value:
+            self.fov.value = degrees
 
     @property
     def one_camera(self) -> bool:

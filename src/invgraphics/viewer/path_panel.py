@@ -15,6 +15,7 @@ from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.tools.camera_path import CameraPath, Keyframe, parse_camera_path, with_keyframe, without
 from invgraphics.viewer.controls import status_block
+from invgraphics.viewer.film_export import RATE, SHAPES
 
 NONE = "none yet"
 """Entry of the list without keyframes."""
@@ -27,6 +28,7 @@ SAMPLES = 24
 SECONDS = 0.2, 10.0
 """Range of the time between keyframes that can be set; a file may have another."""
 LINE = (0, 158, 115)
+SHAPE = "The photographs' or the window's. The field of view from top to bottom is the keyframes'."
 FILM = "An MP4 file at full size: of one run, the second where that is shown alone, and of its prediction for truth and error."
 
 
@@ -82,6 +84,8 @@ class PathPanel:
             self._play = gui.add_button("Play")
             save = gui.add_button("Save path", hint="A JSON file, for `invgraphics render RUN --path FILE.json`.")
             self._upload = gui.add_upload_button("Load path", hint="A file of Save path.", mime_type="application/json")
+            self.shape = gui.add_dropdown("Film shape", SHAPES, hint=SHAPE)
+            self.rate = gui.add_slider("Frames per second", 1, 60, 1, RATE, hint="Of the film.")
             self._export = gui.add_button("Export film", hint=FILM)
             self._status = gui.add_html("")
         for button, handler in (

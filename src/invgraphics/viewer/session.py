@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import math
 import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -20,7 +21,7 @@ from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera, fov_and_as
 from invgraphics.viewer.controls import BACKGROUNDS, FREE_CAMERA, Callbacks, Controls, jump_notice, on_change
 from invgraphics.viewer.crop import crop_note
 from invgraphics.viewer.crop_panel import CropPanel
-from invgraphics.viewer.film_export import FilmLook, export_film, film_cameras
+from invgraphics.viewer.film_export import FilmLook, export_film, film_size
 from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.overlays import Overlays, plain_background
 from invgraphics.viewer.path_panel import PathCallbacks, PathPanel
@@ -41,7 +42,9 @@ class Session:
     def __init__(self, client: ClientHandle, shared: SharedState) -> None:
         self._client, self._shared = client, shared
         names = [name for name, _ in shared.views]
-        callbacks = Callbacks(self._output_changed, self._view_chosen, self._overlays_changed, self._save_image)
+        callbacks = Callbacks(
+            self._output_changed, self._view_chosen, self._overlays_changed, self._save_image, self._fov_changed
+        )
         self._controls = Controls(client.gui, shared.renderer.runs, names, shared.max_size, callbacks)
         self._crop = CropPanel(client.gui, client.scene, lambda: self._scene)
         for handle in (self._crop.enabled, *self._crop.axes):
@@ -82,6 +85,7 @@ class Session:
 
     def _set_camera(self, pose: Float[Tensor, "4 4"], fov: float) -> None:
         self._sent_at = send_camera(self._client, pose, fov, self._scene, self._shared.up)
+        self._controls.show_fov(fov)
 
     def show_held(self) -> None:
         """Say that a newer checkpoint waits; called by the render thread."""
@@ -151,23 +155,33 @@ class Session:
             return
         if self._view_index is not None:
             if self._move is not None and self._move.has_left(self._camera, time.monotonic()):
-                self._view_index, self._notice = None, ""
-                self._controls.view.value = FREE_CAMERA
-                self._submit("overlays", self._update_overlays())
+                self._leave_photograph()
             elif self._requested == self._letterboxed:
                 return  # unchanged
             else:
                 self._client.camera.fov = self._letterbox().fov
+                self._controls.show_fov(self._client.camera.fov)
+        self._request_frame()
+
+    def _leave_photograph(self) -> None:
+        """Free the camera; at a photograph, its frustum is shown again."""
+        if self._view_index is not None:
+            self._view_index = None
+            self._submit("overlays", self._update_overlays())
+        self._notice, self._controls.view.value = "", FREE_CAMERA
+
+    async def _fov_changed(self) -> None:
+        self._leave_photograph()
+        self._client.camera.fov = math.radians(float(self._controls.fov.value))
         self._request_frame()
 
     async def _view_chosen(self) -> None:
         name, self._notice = self._controls.view.value, ""
-        if name != FREE_CAMERA:
+        if name == FREE_CAMERA:
+            self._leave_photograph()
+            self._request_frame()
+        else:
             self.go_to_view([each for each, _ in self._shared.views].index(name))
-            return
-        self._view_index = None
-        self._submit("overlays", self._update_overlays())
-        self._request_frame()
 
     async def _output_changed(self) -> None:
         self._crop.show_outline(self._controls.one_camera)
@@ -177,9 +191,7 @@ class Session:
             self._notice = jump_notice(self._controls.output.value, self._shared.views[index][0])
             self.go_to_view(index)
         else:
-            self._submit("overlays", self._update_overlays())
-            self._controls.show_status(RENDERING)
-            self._request_frame()
+            await self._overlays_changed()
 
     async def _overlays_changed(self) -> None:
         self._submit("overlays", self._update_overlays())
@@ -211,21 +223,18 @@ class Session:
 
     def _move_to(self, keyframe: Keyframe) -> None:
         """Move the camera to a keyframe."""
-        at_photograph = self._view_index is not None
-        self._view_index, self._notice = None, ""
-        if at_photograph:
-            self._submit("overlays", self._update_overlays())  # shows its frustum again
-        self._controls.view.value = FREE_CAMERA
-        pose = keyframe.local_pose(self._scene)
-        self._set_camera(pose, keyframe.fov)
+        self._leave_photograph()
+        self._set_camera(keyframe.local_pose(self._scene), keyframe.fov)
 
     def _export(self, path: CameraPath) -> None:
         """Render a film of the path in the render thread and send it to the browser."""
         run = self._runs[-1 if self._controls.layout.value == "second" else 0]
         box = self._crop.box
         box = None if box is None else run.crop_to_local(box, self._scene)
-        look = FilmLook(self._controls.free_output, BACKGROUNDS[self._controls.background.value], box)
-        cameras = film_cameras(path, run, int(self._controls.max_size.value))
+        background, rate = BACKGROUNDS[self._controls.background.value], int(self._path.rate.value)
+        look = FilmLook(self._controls.free_output, background, box, rate)
+        size = film_size(self._path.shape.value, run, self._window, int(self._controls.max_size.value))
+        cameras = path.cameras(run.scene, path.frame_count(rate), size)
         self._submit("film", export_film(run, cameras, look, self._show_film_progress, self._send_film))
 
     def _show_film_progress(self, line: str) -> None:
