@@ -1,6 +1,7 @@
 """A run leaves as a file and comes back as a run; what a format loses is said."""
 
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,7 +26,7 @@ from invgraphics.runs import checkpoint
 from invgraphics.runs.folder import CHECKPOINT
 from invgraphics.runs.run import read_run
 from invgraphics.tools import EXPORTERS
-from invgraphics.tools.export import ExportRequest, export_run
+from invgraphics.tools.export import ExportRequest, decibels, export_run
 from invgraphics.tools.file_frames import file_from_world
 from invgraphics.tools.import_gaussians import ImportRequest, import_run
 
@@ -91,6 +92,13 @@ def test_there_and_back(run: Path, toy_folder: Path, tmp_path: Path, capsys, to:
     ours, theirs = _quality(run), _quality(back)
     assert set(ours) == set(theirs)
     assert abs(ours["psnr"] - theirs["psnr"]) < {"ply": 1e-4, "splat": 0.1, "spz": 0.1}[to]
+
+
+def test_a_perfect_view_does_not_make_the_average_infinite() -> None:
+    """Squared errors of 0, 1e-9 and 1e-10 are 3.67e-10 in the mean."""
+    assert decibels([math.inf, 90.0, 100.0]) == "94.4 dB on average over 3 test views, 90.0 dB at worst"
+    assert decibels([50.0, 50.0]) == "50.0 dB on average over 2 test views, 50.0 dB at worst"
+    assert decibels([math.inf, math.inf]) == "equal"
 
 
 @pytest.mark.parametrize(("option", "degree"), [([], 3), (["--sh-degree", "1"], 1), (["--sh-degree", "0"], 0)])

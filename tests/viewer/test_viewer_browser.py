@@ -213,7 +213,7 @@ def test_the_picture_can_be_saved_on_another_background(watch: Any, runs: dict[s
         watcher.page.get_by_role("button", name="Save picture").click()
     download.value.save_as(tmp_path / "saved.png")
     saved = np.asarray(Image.open(tmp_path / "saved.png")).astype(float)
-    assert float(saved.min()) < 5 and saved.shape[2] == 3
+    assert float(saved.min()) < 5 and saved.shape == (32, 32, 3), "the photograph's camera, without bars"
     assert watcher.complaints == []
 
 
@@ -265,6 +265,31 @@ def test_a_camera_path_is_recorded_played_saved_and_filmed(watch: Any, runs: dic
 
     page.get_by_role("button", name="Delete keyframe").click()
     page.get_by_text("1 keyframe, 0.0 s").wait_for(timeout=PATIENCE)
+    with page.expect_file_chooser(timeout=PATIENCE) as chooser:
+        page.get_by_role("button", name="Load path").click()
+    chooser.value.set_files(tmp_path / "path.json")
+    page.get_by_text("Loaded path.json.").wait_for(timeout=PATIENCE)
+    page.get_by_text("2 keyframes, 2.0 s").wait_for(timeout=PATIENCE)
+    assert watcher.value("Keyframe") == "2 of 2"
+    watcher.page.wait_for_timeout(1000)
+    watcher.canvas("loaded")
+    assert watcher.complaints == []
+
+
+def test_another_field_of_view_frees_the_camera(watch: Any, runs: dict[str, Path]) -> None:
+    watcher = watch(runs["splatting/gaussians"])
+    before = watcher.canvas("photograph")
+    number = watcher.page.locator("xpath=//*[text()='Field of view']/following::input[not(@type='hidden')][1]")
+    assert abs(float(number.input_value()) - 50) > 1, "the photograph's, not what the slider began with"
+    number.fill("90")
+    number.press("Enter")
+    watcher.page.wait_for_timeout(800)
+    watcher.rest()
+    assert watcher.value("View") == "free camera"
+    assert watcher.viewer._sessions[0]._client.camera.fov == pytest.approx(np.pi / 2)
+    wide = watcher.canvas("wide")
+    near, far = (np.abs(one - 255).max(axis=2) > 40 for one in (before[:, 200:-200], wide[:, 200:-200]))
+    assert 0 < far.sum() < 0.5 * near.sum(), "what is seen through a wider lens is smaller"
     assert watcher.complaints == []
 
 

@@ -101,6 +101,26 @@ def test_hosts_of_other_addresses(listens: str, host: str, answered: bool) -> No
     assert (HostCheck(listens).refusal(Headers({"Host": host})) is None) is answered
 
 
+def test_allowed_hosts(runs: dict[str, Path]) -> None:
+    """Names of a proxy and of the machine around a container: pages, handshakes, and none but those names."""
+    names = ("Viewer.example.org", "docker-box", "2001:db8::7")
+    with open_viewer(ViewerConfig((runs["volumetric/hash"],), port=0, allowed_hosts=names), print) as viewer:
+        for host in ("viewer.example.org", "viewer.example.org:8443", "docker-box:9000", "[2001:db8::7]:80", "localhost"):
+            assert _status(viewer.port, f"Host: {host}") == 200, host
+        for host in ("evil.example", "example.org", "a.viewer.example.org", "192.0.2.1", "[2001:db8::8]"):
+            assert _status(viewer.port, f"Host: {host}") == 403, host
+        own = "Host: viewer.example.org"
+        assert _status(viewer.port, own, "Origin: https://viewer.example.org", websocket=True) == 101, "a proxy with TLS"
+        assert _status(viewer.port, own, "Origin: https://evil.example", websocket=True) == 403
+    assert "--allow-host" in str(HostCheck("127.0.0.1").refusal(Headers({"Host": "docker-box"})))
+
+
+@pytest.mark.parametrize("name", ["http://a.example", "a.example:80", "a/b", "", "*", "a b", "x@y", "*.example.org"])
+def test_allowed_hosts_are_bare_names(runs: dict[str, Path], name: str) -> None:
+    with pytest.raises(InputError, match="--allow-host cannot be"):
+        open_viewer(ViewerConfig((runs["volumetric/hash"],), port=0, allowed_hosts=(name,)), print)
+
+
 def test_a_viser_that_cannot_be_checked_is_not_served(runs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     infra = sys.modules["viser.infra._infra"]
     frozen = type(sys)("websockets")  # as if viser had looked its server up beforehand

@@ -22,7 +22,7 @@ from invgraphics.tools.colorize import EMPTY, ERROR_LIMIT, resize_image
 from invgraphics.viewer.cameras import LetterboxedView, ViewerCamera
 from invgraphics.viewer.loaded_run import LoadedRun, open_run
 from invgraphics.viewer.overlays import CameraFrustums, Overlays
-from invgraphics.viewer.progressive import ProgressiveRenderer, RenderRequest
+from invgraphics.viewer.progressive import LAYOUTS, ProgressiveRenderer, RenderRequest
 from invgraphics.viewer.resolution import MIN_PIXELS
 
 METHODS = ("volumetric/nerf", "volumetric/hash", "splatting/gaussians")
@@ -84,6 +84,7 @@ def test_at_a_photograph_the_picture_is_the_one_that_was_scored(
         around = frame.image.copy()
         around[rows, columns] = EMPTY
         assert (around == EMPTY).all()
+        assert np.abs(frame.picture.astype(int) - saved).max() <= 1, "what is saved has no bars"
         scores = json.loads((run / "scores.json").read_text())["quality"]["psnr"]["per_view"]
         assert frame.psnr == pytest.approx((scores[index],), abs=0.01)
 
@@ -98,6 +99,9 @@ def test_truth_is_the_photograph_and_error_its_difference(loaded_runs: dict[str,
     saved = folder / json.loads((folder / "provenance.json").read_text())["truth"] / "0000.png"
     expected = np.asarray(Image.open(saved))
     np.testing.assert_array_equal(truth.image, expected)
+    (wide,), _ = _frames(replace(request, camera=_camera(loaded)), loaded)
+    assert wide.image.shape[1] > 32
+    np.testing.assert_array_equal(wide.picture, expected)
 
     error = _frames(replace(request, output="error"), loaded)[0][-1]
     prediction = np.asarray(Image.open(folder / "test" / "0000.png"))
@@ -160,6 +164,10 @@ def test_side_by_side_shows_both_whole(loaded_runs: dict[str, LoadedRun]) -> Non
         assert np.abs(both.image[:, columns].astype(int) - _composited(one, half)[:, whole]).max() <= 1
     at_view = _frames(replace(request, view=pair[0].scene.test[0]), *pair)[0][-1]
     assert len(at_view.psnr) == 2
+    first, second = (_frames(replace(request, view=pair[0].scene.test[0], layout=which), *pair)[0][-1] for which in LAYOUTS[2:])
+    assert at_view.picture.shape == (32, 64, 3), "without bars"
+    assert np.abs(at_view.picture[:, :31].astype(int) - first.picture[:, :31]).max() <= 1
+    assert np.abs(at_view.picture[:, 32:].astype(int) - second.picture).max() <= 1
 
 
 class Slow(LoadedRun):
@@ -239,7 +247,7 @@ def test_cameras_follow_refined_poses(balls: Path, tmp_path: Path) -> None:
     run = fit_run(FitRequest(method=method, scene=str(balls), out=str(tmp_path / "run"), budget="3steps", overrides=overrides))
     loaded, drawn = LoadedRun(open_fitted(run)), []
     overlays = Overlays(_Drawn(drawn), loaded, CameraFrustums(loaded), lambda index: None)
-    list(overlays.update(splats=False, frustums=True, hidden=None))
+    list(overlays.update(splats=None, frustums=True, hidden=None))
     assert len(drawn) == len(loaded.views())
     assert not overlays.remove_outdated()
     before = torch.stack([view.camera.position for view in loaded.scene.train])
@@ -254,7 +262,7 @@ def test_cameras_follow_refined_poses(balls: Path, tmp_path: Path) -> None:
     assert float((after - before).norm(dim=1).max()) > 0.1
     assert torch.equal(after, fresh)
     assert overlays.remove_outdated()
-    list(overlays.update(splats=False, frustums=True, hidden=None))
+    list(overlays.update(splats=None, frustums=True, hidden=None))
     assert len(drawn) == 2 * len(loaded.views())
     assert sum(handle.gone for handle in drawn) == len(loaded.views())
     torch.testing.assert_close(torch.tensor(drawn[-1].position), after[-1])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from invgraphics.cli.arguments import SMALLEST
 from invgraphics.errors import InputError
@@ -30,6 +30,8 @@ class View:
         view: Test view to start at.
         host: Address to listen at. The default is reachable from this machine only; 0.0.0.0 from any machine.
         port: Port to listen at; 0 for any that is free.
+        allow_host: Another name at which browsers reach the viewer, as a proxy's or a container's host; requests to others are
+            refused.
         max_size: Most pixels along the pictures' longer side.
         no_open: Do not open the page in a browser.
         scene: Another copy of the scene, for instance where the data set has moved.
@@ -41,6 +43,7 @@ class View:
     view: Annotated[int, arg(metavar="N")] = 0
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
     port: Annotated[int, arg(metavar="N")] = 8080
+    allow_host: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
     max_size: Annotated[int, arg(metavar="N")] = 800
     no_open: Annotated[bool, arg(help_behavior_hint="(default: it is opened, where there is a screen)")] = False
     scene: Annotated[str | None, arg(metavar="SCENE", help_behavior_hint="(default: the run's own)")] = None
@@ -53,7 +56,7 @@ class View:
         from invgraphics.viewer.launch import ViewerConfig, is_loopback, open_viewer, url_host
 
         runs = (self.folder,) if self.other is None else (self.folder, self.other)
-        config = ViewerConfig(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene)
+        config = ViewerConfig(runs, self.live, self.view, self.host, self.port, self.max_size, self.scene, self.allow_host)
         with open_viewer(config, _notify) as viewer:
             url = f"http://{url_host(self.host)}:{viewer.port}"
             if not is_loopback(self.host):

@@ -19,7 +19,7 @@ from invgraphics.core import Camera, Scene
 from invgraphics.core.transforms import apply_similarity
 from invgraphics.errors import InputError
 from invgraphics.files import write_text
-from invgraphics.tables import read_json
+from invgraphics.tables import LIMITS, parse_json, read_json
 from invgraphics.tools.paths import interpolate_poses
 
 SCHEMA = 1
@@ -142,6 +142,25 @@ def read_camera_path(file: Path) -> CameraPath:
         table = read_json(file)
     except InputError as error:
         raise InputError(f"The camera path '{file}' cannot be read: {error.sentence}", "Save one in the viewer.") from error
+    return _camera_path(table, str(file))
+
+
+def parse_camera_path(content: bytes, name: str) -> CameraPath:
+    """Read a path from the content of a file of this name.
+
+    Raises:
+        InputError: it is no valid camera path.
+    """
+    try:
+        if len(content) > LIMITS.json_bytes:
+            raise ValueError(f"it has {len(content)} bytes, more than {LIMITS.json_bytes}")
+        text = content.decode("utf-8-sig")
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise InputError(f"'{name}' is no text that can be used: {error}.", "Choose a file that the viewer saved.") from error
+    return _camera_path(parse_json(text, f"'{name}'"), name)
+
+
+def _camera_path(table: Any, file: str) -> CameraPath:
     if not isinstance(table, dict) or table.get("kind") != KIND:
         raise _invalid(file, f'has no "kind": "{KIND}"')
     if table.get("schema") != SCHEMA:
@@ -157,7 +176,7 @@ def read_camera_path(file: Path) -> CameraPath:
     return CameraPath(tuple(_keyframe(entry, index, file) for index, entry in enumerate(keyframes)), seconds, table["loop"])
 
 
-def _keyframe(entry: Any, index: int, file: Path) -> Keyframe:
+def _keyframe(entry: Any, index: int, file: str) -> Keyframe:
     rows, degrees = (entry.get(key) if isinstance(entry, dict) else None for key in ("camera_to_world", "fov_degrees"))
     if not _is_number(degrees) or not NARROWEST <= degrees < 180:
         raise _invalid(file, f"has fov_degrees {degrees} at keyframe {index}, not between {NARROWEST:g} and 180")
@@ -184,7 +203,7 @@ def _is_matrix(rows: Any) -> bool:
     return isinstance(rows, list) and len(rows) == 4 and all(is_row(row) for row in rows)
 
 
-def _invalid(file: Path, what: str) -> InputError:
+def _invalid(file: str, what: str) -> InputError:
     return InputError(f"'{file}' {what}.", "Expected a camera path as the viewer saves it.")
 
 

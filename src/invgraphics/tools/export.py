@@ -202,11 +202,11 @@ def render_gaussians(gaussians: Gaussians, renderer: Renderer, fitted: Fitted, c
 
 
 def decibels(values: list[float]) -> str:
-    """Format the mean and the lowest of several PSNRs (dB) in words."""
+    """Format the PSNR of the mean squared error and the lowest of several PSNRs (dB, infinite without error) in words."""
     if math.isinf(min(values)):
         return "equal"
-    mean = sum(values) / len(values)
-    return f"{mean:.1f} dB on average over {len(values)} test views, {min(values):.1f} dB at worst"
+    error = sum(10 ** (-value / 10) for value in values) / len(values)
+    return f"{-10 * math.log10(error):.1f} dB on average over {len(values)} test views, {min(values):.1f} dB at worst"
 
 
 def on_device(gaussians: Gaussians, device: torch.device) -> Gaussians:

@@ -1,13 +1,19 @@
-"""Move of a browser's camera to a photograph: separates late reports from a camera that was moved away."""
+"""Moves of a browser's camera: sending one, and telling late reports from a camera that its user has moved away."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from invgraphics.viewer.cameras import ViewerCamera
+from invgraphics.core import Scene
+from invgraphics.viewer.cameras import ViewerCamera, rotation_quaternion
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
 
 NEAR_ENOUGH = 1e-3
 """How far from a photograph's camera a browser may be to count as at it: radians, and of the scene's extent."""
@@ -46,3 +52,31 @@ class CameraMove:
 
     def _is_at(self, camera: ViewerCamera, pose: Float[Tensor, "4 4"]) -> bool:
         return camera.is_at(pose, NEAR_ENOUGH * self.extent, NEAR_ENOUGH)
+
+
+def send_camera(
+    client: ClientHandle, pose: Float[Tensor, "4 4"], fov: float, scene: Scene, up: tuple[float, float, float]
+) -> float:
+    """Send a browser a camera; it turns around the point ahead that is nearest to the scene's centre.
+
+    Args:
+        client: the browser.
+        pose: camera-to-world in the scene's local frame.
+        fov: vertical field of view, radians.
+        scene: of the first run.
+        up: of the orbit controls, in the local frame.
+
+    Returns:
+        Viser's time stamp of the camera.
+    """
+    camera, position, forward = client.camera, pose[:3, 3].double(), pose[:3, 2].double()
+    reach = float((scene.bounds.centre.double() - position) @ forward)
+    turning = position + forward * (reach if reach > 0 else scene.bounds.radius)
+    with client.atomic():
+        camera.position = position.numpy()
+        # Viser tilts the up direction that it has to fit the pose: without the scene's own, tilts would add up.
+        camera.up_direction = up
+        camera.wxyz = np.array(rotation_quaternion(pose))
+        camera.look_at = turning.numpy()
+        camera.fov = fov
+    return camera.update_timestamp

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from invgraphics.tools.colorize import OUTPUTS
+from invgraphics.core import View
+from invgraphics.tools.colorize import NEEDS_TRUTH, OUTPUTS
+from invgraphics.viewer.cameras import ViewerCamera
+from invgraphics.viewer.crop import CropBox
 from invgraphics.viewer.loaded_run import LoadedRun
-from invgraphics.viewer.progressive import LAYOUTS, ViewerFrame
+from invgraphics.viewer.progressive import LAYOUTS, RenderRequest, ViewerFrame
 
 FREE_CAMERA = "free camera"
 """Entry of the view list for a camera that is at no photograph."""
 SMALLEST, LARGEST = 64, 2048
 """Range of the resolution limit, pixels along the longer side."""
+
+FOVS = 5, 120
+"""Range of the field of view, degrees."""
 
 BACKGROUNDS = {"the scene's": None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 """Name -> colour behind predictions; scores keep the scene's own."""
@@ -31,12 +38,14 @@ class Callbacks:
         view: a photograph was chosen.
         overlays: what the browser draws itself has changed.
         save: the current image is wanted as a file.
+        fov: another field of view was chosen.
     """
 
     output: Callback
     view: Callback
     overlays: Callback
     save: Callback
+    fov: Callback
 
 
 class Controls:
@@ -56,6 +65,13 @@ class Controls:
             "Show", OUTPUTS, hint="Truth and error are known at photographs only; choosing them goes to the nearest one."
         )
         self.view = gui.add_dropdown("View", (FREE_CAMERA, *views), hint="Puts the camera where a photograph was taken.")
+        self.fov = gui.add_slider(
+            "Field of view",
+            *FOVS,
+            1,
+            50,
+            hint="From top to bottom, in degrees. At a photograph it is the photograph's: others leave it.",
+        )
         several = len(runs) > 1
         self.layout = gui.add_dropdown("Runs", LAYOUTS if several else ("first",), visible=several)
         self.split = gui.add_slider("Split at", 0.0, 1.0, 0.01, 0.5, visible=several)
@@ -66,7 +82,7 @@ class Controls:
         self.splats = gui.add_checkbox(
             "Splats drawn by the browser",
             False,
-            visible=runs[0].has_gaussians,
+            visible=any(run.has_gaussians for run in runs),
             hint="Smooth while moving. Colours without view dependence; the run's own renderer is not used.",
         )
         top = max(LARGEST, max_size)
@@ -85,12 +101,66 @@ class Controls:
 
         save.on_click(saved)
         on_change(self.view, callbacks.view)
+        on_change(self.fov, callbacks.fov)
         for handle in (self.cameras, self.splats):
             on_change(handle, callbacks.overlays)
 
-    def update_summary(self) -> None:
-        """Update name, training progress and scores of the runs."""
-        self._facts.content = "".join(_facts_of(run) for run in self._runs)
+    def update_summary(self, notice: str = "") -> None:
+        """Update name, training progress and scores of the runs, under a line of text."""
+        above = status_block(escape(notice)) if notice else ""
+        self._facts.content = above + "".join(_facts_of(run) for run in self._runs)
+
+    def show_fov(self, radians: float) -> None:
+        """Show a vertical field of view; one beyond the slider's range at its end."""
+        degrees = min(max(round(math.degrees(radians)), FOVS[0]), FOVS[1])
+        if degrees != self.fov.value:
+            self.fov.value = degrees
+
+    @property
+    def one_camera(self) -> bool:
+        """Whether the whole window shows one camera, so that what the browser draws fits the picture."""
+        return self.layout.value != "side by side"
+
+    @property
+    def splat_run(self) -> LoadedRun | None:
+        """The run whose splats the browser draws: the second if that is shown alone, and the other one if it has none."""
+        if not self.splats.value:
+            return None
+        wanted = self._runs[::-1] if self.layout.value == "second" else self._runs
+        return next((run for run in wanted if run.has_gaussians), None)
+
+    def show_splat_status(self, run: LoadedRun, cropped: bool) -> None:
+        """Show whose splats the browser draws, and which controls have no effect on them."""
+        alone = {"first": self._runs[0], "second": self._runs[-1]}.get(self.layout.value)
+        idle = {"Show": self.output.value != "prediction", "Crop": cropped, "Runs": len(self._runs) > 1 and run is not alone}
+        names = ", ".join(name for name, without_effect in idle.items() if without_effect)
+        self.show_status(
+            "Drawn by the browser: colours without view dependence.",
+            f"These are the splats of {run.name}." if len(self._runs) > 1 else "",
+            f"Without effect on them: {names}." if names else "",
+        )
+
+    @property
+    def free_output(self) -> str:
+        """What is shown where there is no photograph: the prediction for outputs that are known at photographs only."""
+        return "prediction" if self.output.value in NEEDS_TRUTH else self.output.value
+
+    def request(
+        self, camera: ViewerCamera, window: tuple[int, int], view: View | None, crop: CropBox | None, skip_coarse: bool
+    ) -> RenderRequest:
+        """What the controls ask to render, at photograph ``view`` or with a free camera; the rest as in `RenderRequest`."""
+        return RenderRequest(
+            camera=camera,
+            window=window,
+            output=self.free_output if view is None else self.output.value,
+            view=view,
+            layout=self.layout.value,
+            split=float(self.split.value),
+            max_size=int(self.max_size.value),
+            skip_coarse=skip_coarse,
+            background=BACKGROUNDS[self.background.value],
+            crop=crop,
+        )
 
     def show_frame(self, frame: ViewerFrame, note: str = "") -> None:
         """Show size, render time, PSNR and legend of a frame."""

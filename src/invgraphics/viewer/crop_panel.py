@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,13 +23,14 @@ class CropPanel:
     Args:
         gui: viser's interface of a browser.
         viser_scene: where the outline is drawn.
-        scene: of the first run.
+        scene: gives that of the first run, whose frame may change with its checkpoint.
     """
 
-    def __init__(self, gui: Any, viser_scene: Any, scene: Scene) -> None:
+    def __init__(self, gui: Any, viser_scene: Any, scene: Callable[[], Scene]) -> None:
         self._scene, self._viser_scene = scene, viser_scene
         self._outline: Any = None
-        lo, hi = slider_range(scene)
+        self._outline_shown = True
+        lo, hi = slider_range(scene())
         with gui.add_folder("Crop box", expand_by_default=False):
             self.enabled = gui.add_checkbox("Crop", False, hint="Renders only what is inside the box.")
             self.axes = [
@@ -48,8 +50,15 @@ class CropPanel:
         """The box in the local frame; ``None`` while cropping is off."""
         if not self.enabled.value:
             return None
-        (x0, x1), (y0, y1), (z0, z1) = ([float(end) / self._scene.scale for end in axis.value] for axis in self.axes)
+        scale = self._scene().scale
+        (x0, x1), (y0, y1), (z0, z1) = ([float(end) / scale for end in axis.value] for axis in self.axes)
         return CropBox((x0, y0, z0), (x1, y1, z1))
+
+    def show_outline(self, shown: bool) -> None:
+        """Show or hide the outline."""
+        self._outline_shown = shown
+        if self._outline is not None:
+            self._outline.visible = shown
 
     def draw(self) -> None:
         """Draw the outline of the current box, or remove it."""
@@ -61,6 +70,7 @@ class CropPanel:
             self._outline = self._viser_scene.add_line_segments(
                 "/crop", corners[list(EDGES)], OUTLINE, thickness=2.0, thickness_units="screen"
             )
+            self._outline.visible = self._outline_shown
 
 
 def slider_range(scene: Scene) -> tuple[list[float], list[float]]:

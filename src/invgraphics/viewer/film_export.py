@@ -6,12 +6,12 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 
 from invgraphics.core import Camera, Rendering
-from invgraphics.tools.camera_path import CameraPath
 from invgraphics.tools.colorize import colorize, depth_range
 from invgraphics.tools.film import PROBE_SIZE, PROBES, FilmWriter
 from invgraphics.viewer.cameras import limit_size
@@ -20,7 +20,9 @@ from invgraphics.viewer.loaded_run import LoadedRun
 from invgraphics.viewer.render_thread import Task
 
 RATE = 24
-"""Frames per second of an exported film."""
+"""Usual frames per second of an exported film."""
+Shape = Literal["photograph", "window"]
+SHAPES: tuple[Shape, ...] = ("photograph", "window")
 
 
 @dataclass(frozen=True)
@@ -31,25 +33,30 @@ class FilmLook:
         output: prediction, depth or normal.
         background: behind predictions, in the scene's colour space; ``None`` for the scene's own.
         crop: in the run's local frame.
+        rate: frames per second.
     """
 
     output: str
     background: tuple[float, float, float] | None
     crop: CropBox | None
+    rate: int = RATE
 
 
-def film_cameras(path: CameraPath, run: LoadedRun, max_size: int) -> list[Camera]:
-    """The frames' cameras in the run's local frame, of the test views' size, at most ``max_size`` along the longer side."""
-    size = limit_size(run.scene.test[0].camera, max_size)
-    return path.cameras(run.scene, path.frame_count(RATE), (size.width, size.height))
+def film_size(shape: Shape, run: LoadedRun, window: tuple[int, int], max_size: int) -> tuple[int, int]:
+    """(width, height) of a film of this shape, at most ``max_size`` along the longer side and as large as its model."""
+    if shape == "photograph":
+        camera = limit_size(run.scene.test[0].camera, max_size)
+        return camera.width, camera.height
+    scale = min(1.0, max_size / max(window))
+    return max(1, round(window[0] * scale)), max(1, round(window[1] * scale))
 
 
 def export_film(
     run: LoadedRun,
     cameras: Sequence[Camera],
     look: FilmLook,
-    on_progress: Callable[[int], None],
-    on_film: Callable[[bytes], None],
+    on_progress: Callable[[str], None],
+    on_film: Callable[[bytes, str], None],
 ) -> Task:
     """Task for the render thread that renders a film, one frame per slice; cancelled, it leaves no file.
 
@@ -57,9 +64,10 @@ def export_film(
         run: what is rendered.
         cameras: in the run's local frame, all of one size.
         look: of the frames.
-        on_progress: called with the number of finished frames.
-        on_film: called with the MP4 file's content.
+        on_progress: called with a line about the progress, for each second of film.
+        on_film: called with the MP4 file's content and a line about it.
     """
+    count = len(cameras)
 
     def render(camera: Camera) -> Rendering:
         return run.render(camera, look.output == "normal", look.crop)
@@ -75,9 +83,11 @@ def export_film(
         span = depth_range(probes, [scene] * len(probes))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "film.mp4"
-        with FilmWriter(out, RATE) as writer:
+        with FilmWriter(out, look.rate) as writer:
             for index, camera in enumerate(cameras):
                 writer.add(colorize(look.output, [render(camera)], [scene], [None], span).pictures[0])
-                on_progress(index + 1)
+                if index % look.rate == 0:
+                    on_progress(f"Exporting: frame {index + 1} of {count}")
                 yield 0.0
-        on_film(out.read_bytes())
+        frames = f"{count} frame{'s' * (count != 1)}"
+        on_film(out.read_bytes(), f"Film of {frames}: the {look.output} of {run.name}. Sent to the browser.")

@@ -20,6 +20,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from invgraphics.errors import InputError
+
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """Host names at which every viewer answers; through a tunnel (``ssh -L``) with any port."""
 
@@ -33,10 +35,12 @@ class HostCheck:
     Attributes:
         host: address or name at which it listens. If that is every address (``0.0.0.0``, ``::``), it answers at numeric
             addresses, which cannot be rebound, and at this machine's name.
+        allowed: further names, lower case, as of a proxy or of the machine whose port is mapped to a container's.
         active: whether a server has been started with the check, see `applied`.
     """
 
     host: str
+    allowed: tuple[str, ...] = ()
     active: bool = field(default=False, init=False)
 
     def refusal(self, headers: Headers) -> str | None:
@@ -48,7 +52,7 @@ class HostCheck:
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_allowed(hosts[0]):
             shown = "', '".join(hosts)[:100]
-            return f"This viewer does not answer at '{shown}'. Use localhost, or start it with --host and that name."
+            return f"This viewer does not answer at '{shown}'. Use localhost, or start it with --allow-host and that name."
         if any(not _is_same(origin, hosts[0]) for origin in origins):
             return "This viewer does not answer pages of other sites."
         return None
@@ -85,12 +89,25 @@ class HostCheck:
         name = _name_of(header)
         if name is None:
             return False
-        if name in LOOPBACK or name == self.host.lower():
+        if name in LOOPBACK or name == self.host.lower() or name in self.allowed:
             return True
         own = _address(self.host)
         if own is None or not own.is_unspecified:
             return False
         return _address(name) is not None or name in (socket.gethostname().lower(), socket.getfqdn().lower())
+
+
+def allowed_host(name: str) -> str:
+    """A name or address as `HostCheck.allowed` holds it.
+
+    Raises:
+        InputError: it is no bare host name or address, as one with a port or a scheme.
+    """
+    bare = name.strip()
+    found = _name_of(f"[{bare}]" if bare.count(":") > 1 and not bare.startswith("[") else bare)
+    if found is None or found != bare.strip("[]").lower() or not all(each.isalnum() or each in "-._:%" for each in found):
+        raise InputError(f"--allow-host cannot be '{name[:80]}'.", "Expected a name without port, as viewer.example.org.")
+    return found
 
 
 def _name_of(header: str) -> str | None:

@@ -30,6 +30,7 @@ class ViewerConfig:
         port: port to listen at, 0 for any that is free.
         max_size: limit of the longer side, pixels.
         scene: another copy of the runs' scene.
+        allowed_hosts: names besides ``host`` and this machine's own at which browsers may reach it.
     """
 
     runs: tuple[Path, ...]
@@ -39,6 +40,7 @@ class ViewerConfig:
     port: int = 8080
     max_size: int = 800
     scene: str | None = None
+    allowed_hosts: tuple[str, ...] = ()
 
 
 def open_viewer(config: ViewerConfig, say: Callable[[str], None]) -> Viewer:
@@ -49,11 +51,15 @@ def open_viewer(config: ViewerConfig, say: Callable[[str], None]) -> Viewer:
         say: called with a sentence before each long wait.
 
     Raises:
-        InputError: viser is missing, a run cannot be shown, the runs do not fit together, or the address cannot be bound.
+        InputError: viser is missing, a run cannot be shown, the runs do not fit together, the address cannot be bound, or an
+            allowed host is no bare name.
     """
     if importlib.util.find_spec("viser") is None:
         raise InputError("The viewer needs viser, which is not installed.", "`pip install 'invgraphics[viewer]'`")
+    from invgraphics.viewer.host_check import allowed_host
+
     check_address(config.host, config.port)
+    allowed = tuple(map(allowed_host, config.allowed_hosts))
     runs = [open_run(run, config.scene, config.live, say) for run in config.runs]
     names = [run.scene.name for run in runs]
     if len(set(names)) > 1:
@@ -64,7 +70,7 @@ def open_viewer(config: ViewerConfig, say: Callable[[str], None]) -> Viewer:
 
     from invgraphics.viewer.server import Address, Viewer
 
-    return Viewer(runs, Address(config.host, config.port), config.view, config.max_size)
+    return Viewer(runs, Address(config.host, config.port, allowed), config.view, config.max_size)
 
 
 def is_loopback(host: str) -> bool:

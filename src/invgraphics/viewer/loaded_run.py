@@ -82,13 +82,14 @@ class LoadedRun:
         """Transform a camera from ``scene``'s local frame to this run's, through the world frame."""
         if scene is self.scene:
             return camera
-        return camera.moved(apply_similarity(self._from_local(scene), camera.cam_to_world.double()).to(camera.cam_to_world))
+        return camera.moved(apply_similarity(self.from_local(scene), camera.cam_to_world.double()).to(camera.cam_to_world))
 
     def crop_to_local(self, crop: CropBox, scene: Scene) -> CropBox:
         """Transform a crop box from ``scene``'s local frame to this run's, as the axis-aligned box around it."""
-        return crop if scene is self.scene else crop.transformed(self._from_local(scene))
+        return crop if scene is self.scene else crop.transformed(self.from_local(scene))
 
-    def _from_local(self, scene: Scene) -> Float[Tensor, "4 4"]:
+    def from_local(self, scene: Scene) -> Float[Tensor, "4 4"]:
+        """The similarity from ``scene``'s local frame to this run's, double precision."""
         return torch.linalg.inv(self.scene.world_from_local.double()) @ scene.world_from_local.double()
 
     def views(self) -> list[tuple[str, View]]:

@@ -12,10 +12,12 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from invgraphics.core import Gaussians, Quantity
+from invgraphics.core import Gaussians, Quantity, Scene
 from invgraphics.core.colour import linear_to_srgb
 from invgraphics.core.harmonics import BAND_0
 from invgraphics.core.transforms import quaternion_to_matrix
+from invgraphics.experiments.evaluate import display
+from invgraphics.fields.similarity import transform_gaussians
 from invgraphics.tools.colorize import Picture, true_image
 from invgraphics.viewer.cameras import fov_and_aspect, rotation_quaternion
 from invgraphics.viewer.loaded_run import LoadedRun
@@ -81,7 +83,7 @@ class Overlays:
 
     Args:
         viser_scene: of the browser.
-        run: whose splats are drawn.
+        run: whose local frame they are in.
         frustums: of its views.
         on_click: awaited with the index of a frustum that is clicked.
     """
@@ -91,15 +93,16 @@ class Overlays:
     ) -> None:
         self._viser_scene, self._run, self._views, self._on_click = viser_scene, run, frustums, on_click
         self._frustums: dict[int, Any] = {}
-        self._splats: Any = None
+        self._splats: dict[LoadedRun, Any] = {}
         self._shown = run.scene
 
-    def update(self, splats: bool, frustums: bool, hidden: int | None) -> Iterator[float]:
-        """Show or hide splats and frustums, except the one of the view ``hidden``; a task of the render thread."""
-        if splats and self._splats is None:
-            self._splats = add_splats(self._run, self._viser_scene)
-        if self._splats is not None:
-            self._splats.visible = splats
+    def update(self, splats: LoadedRun | None, frustums: bool, hidden: int | None) -> Iterator[float]:
+        """Show the splats of one run or none, and frustums except that of the view ``hidden``; a task of the render thread."""
+        if splats is not None and splats not in self._splats:
+            name = f"/splats-{len(self._splats)}"
+            self._splats[splats] = add_splats(splats, self._viser_scene, name, self._run.scene)
+        for run, handle in self._splats.items():
+            handle.visible = run is splats
         for index in range(len(self._views)):
             wanted = frustums and index != hidden
             if index not in self._frustums and wanted:
@@ -114,9 +117,9 @@ class Overlays:
         Returns:
             Whether cameras have moved, as those of a fit that refines their poses.
         """
-        if self._splats is not None:
-            self._splats.remove()
-            self._splats = None
+        for handle in self._splats.values():
+            handle.remove()
+        self._splats.clear()
         moved, self._shown = self._shown is not self._run.scene, self._run.scene
         if moved:
             for handle in self._frustums.values():
@@ -125,17 +128,29 @@ class Overlays:
         return moved
 
 
-def add_splats(run: LoadedRun, viser_scene: Any) -> Any:
-    """Add a run's Gaussians to a viser scene, coloured by spherical-harmonics band 0; returns their handle."""
+def plain_background(scene: Scene, colour: tuple[float, float, float] | None) -> Picture:
+    """A picture of one colour, in the scene's colour space; ``None`` is the scene's own."""
+    chosen = scene.background if colour is None else torch.tensor(colour)
+    return display(chosen.expand(2, 2, 3), scene).numpy()
+
+
+def add_splats(run: LoadedRun, viser_scene: Any, name: str, scene: Scene) -> Any:
+    """Add a run's Gaussians, coloured by spherical-harmonics band 0, to a viser scene in ``scene``'s local frame.
+
+    Returns:
+        Their handle.
+    """
     ctx = run.fitted.model.context()
     with torch.no_grad():
         gaussians: Gaussians = run.fitted.model.field.primitives(Quantity.GAUSSIANS, ctx)
         rgb = (0.5 + BAND_0 * gaussians.sh[:, 0]).clamp(0, 1)
         rgb = linear_to_srgb(rgb) if run.scene.colour == "linear" else rgb
+        if run.scene is not scene:
+            gaussians = transform_gaussians(gaussians, torch.linalg.inv(run.from_local(scene)).to(gaussians.means))
         unit = half_precision_scale(gaussians)
         centres, covariances = _moments(gaussians)
     return viser_scene.add_gaussian_splats(
-        "/splats",
+        name,
         centers=(centres * unit).astype(np.float32),
         covariances=(covariances * unit**2).astype(np.float32),
         rgbs=rgb.cpu().numpy(),

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from invgraphics.core import Scene
-from invgraphics.tools.camera_path import CameraPath, Keyframe, with_keyframe, without
+from invgraphics.errors import InputError
+from invgraphics.tools.camera_path import CameraPath, Keyframe, parse_camera_path, with_keyframe, without
 from invgraphics.viewer.controls import status_block
+from invgraphics.viewer.film_export import RATE, SHAPES
 
 NONE = "none yet"
 """Entry of the list without keyframes."""
@@ -23,7 +25,10 @@ ECHO = 0.5
 """Seconds after a change of the list within which selections are the browser's echoes of it."""
 SAMPLES = 24
 """Segments of the drawn path between two keyframes."""
+SECONDS = 0.2, 10.0
+"""Range of the time between keyframes that can be set; a file may have another."""
 LINE = (0, 158, 115)
+SHAPE = "The photographs' or the window's. The field of view from top to bottom is the keyframes'."
 FILM = "An MP4 file at full size: of one run, the second where that is shown alone, and of its prediction for truth and error."
 
 
@@ -37,6 +42,7 @@ class PathCallbacks:
         export: starts the export of a film; progress is shown with `PathPanel.show_status`.
         stop_export: cancels it.
         download: sends a file to the browser.
+        changed: takes the path after each change.
     """
 
     current: Callable[[], Keyframe]
@@ -44,6 +50,7 @@ class PathCallbacks:
     export: Callable[[CameraPath], None]
     stop_export: Callable[[], None]
     download: Callable[[str, bytes], None]
+    changed: Callable[[CameraPath], None]
 
 
 class PathPanel:
@@ -52,26 +59,33 @@ class PathPanel:
     Args:
         gui: viser's interface of a browser.
         viser_scene: where the path is drawn.
-        scene: of the first run.
+        scene: gives that of the first run, whose frame may change with its checkpoint.
+        path: to begin with.
         callbacks: of the session.
     """
 
-    def __init__(self, gui: Any, viser_scene: Any, scene: Scene, callbacks: PathCallbacks) -> None:
+    def __init__(
+        self, gui: Any, viser_scene: Any, scene: Callable[[], Scene], path: CameraPath, callbacks: PathCallbacks
+    ) -> None:
         self._viser_scene, self._scene, self._callbacks = viser_scene, scene, callbacks
-        self.path = CameraPath(())
+        self.path = path
         self._playing: asyncio.Task[None] | None = None
         self._exporting = False
         self._listed, self._listed_at = NONE, 0.0
         self._line: Any = None
+        self._line_shown = True
         with gui.add_folder("Camera path", expand_by_default=False):
             add = gui.add_button("Add keyframe", hint="The current view, after the keyframe that is selected below.")
             self.selected = gui.add_dropdown("Keyframe", (NONE,), hint="Selecting another one goes there.")
             back = gui.add_button("Go to keyframe", hint="The selected one.")
             delete = gui.add_button("Delete keyframe")
-            self.seconds = gui.add_slider("Seconds between", 0.2, 10.0, 0.1, self.path.seconds)
+            self.seconds = gui.add_slider("Seconds between", *SECONDS, 0.1, CameraPath(()).seconds)
             self.loop = gui.add_checkbox("Loop", False, hint="Returns to the first keyframe.")
             self._play = gui.add_button("Play")
             save = gui.add_button("Save path", hint="A JSON file, for `invgraphics render RUN --path FILE.json`.")
+            self._upload = gui.add_upload_button("Load path", hint="A file of Save path.", mime_type="application/json")
+            self.shape = gui.add_dropdown("Film shape", SHAPES, hint=SHAPE)
+            self.rate = gui.add_slider("Frames per second", 1, 60, 1, RATE, hint="Of the film.")
             self._export = gui.add_button("Export film", hint=FILM)
             self._status = gui.add_html("")
         for button, handler in (
@@ -83,9 +97,10 @@ class PathPanel:
             (self._export, self._toggle_export),
         ):
             button.on_click(_ignoring_event(handler))
-        for handle, handler in ((self.selected, self._go), (self.seconds, self._retime), (self.loop, self._retime)):
+        self._upload.on_upload(_ignoring_event(self._load))
+        for handle, handler in ((self.selected, self._go), (self.seconds, self._retime), (self.loop, self._reloop)):
             handle.on_update(_by_user(handler))
-        self.show_status("")
+        self._take(path)
 
     def show_status(self, line: str, exporting: bool | None = None) -> None:
         """Show the path's length and a line of text; ``exporting`` switches the export button."""
@@ -95,6 +110,12 @@ class PathPanel:
         if exporting is not None:
             self._exporting = exporting
             self._export.label = "Stop export" if exporting else "Export film"
+
+    def show_line(self, shown: bool) -> None:
+        """Show or hide the drawn path; while it plays it is hidden."""
+        self._line_shown = shown
+        if self._line is not None:
+            self._line.visible = shown and self._playing is None
 
     def close(self) -> None:
         """Stop playing."""
@@ -135,25 +156,52 @@ class PathPanel:
             self._callbacks.move(self.path.keyframes[index])
 
     async def _retime(self) -> None:
-        self.path = replace(self.path, seconds=float(self.seconds.value), loop=bool(self.loop.value))
+        self.path = replace(self.path, seconds=float(self.seconds.value))
         self._changed()
 
+    async def _reloop(self) -> None:
+        self.path = replace(self.path, loop=bool(self.loop.value))
+        self._changed()
+
+    async def _load(self) -> None:
+        file = self._upload.value
+        try:
+            path = parse_camera_path(file.content, file.name)
+        except InputError as error:
+            self.show_status(error.sentence)
+            return
+        self._take(path)
+        self.show_status(f"Loaded {file.name}.")
+
+    def _take(self, path: CameraPath) -> None:
+        """Edit ``path`` from now on, its last keyframe selected."""
+        self.path = path
+        self.seconds.value, self.loop.value = min(max(path.seconds, SECONDS[0]), SECONDS[1]), path.loop
+        self._list(len(path.keyframes) - 1)
+
     def _changed(self) -> None:
-        """Update status and drawing; a path that plays goes on with its next camera, or stops where it has become too short."""
+        """Update status and drawing, hand the path on, and stop one that plays and has become too short."""
         self.show_status("")
+        self._callbacks.changed(self.path)
         if self._playing is not None and len(self.path.keyframes) < 2:
             self.close()
             self._stopped()
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw the path where the scene's frame has it now."""
         if self._line is not None:
             self._line.remove()
             self._line = None
         if len(self.path.keyframes) > 1:
+            scene = self._scene()
             times = np.linspace(0, self.path.duration, SAMPLES * len(self.path.keyframes))
-            places = np.stack([one.local_pose(self._scene)[:3, 3].numpy() for one in self.path.at(times)])
+            places = np.stack([one.local_pose(scene)[:3, 3].numpy() for one in self.path.at(times)])
             segments = np.stack([places[:-1], places[1:]], axis=1)
             self._line = self._viser_scene.add_line_segments(
                 "/camera-path", segments, LINE, thickness=2.0, thickness_units="screen"
             )
+            self.show_line(self._line_shown)
 
     async def _toggle_play(self) -> None:
         if self._playing is not None:
@@ -163,9 +211,8 @@ class PathPanel:
             self.show_status("Playing needs two keyframes.")
         else:
             self._play.label = "Stop"
-            if self._line is not None:
-                self._line.visible = False
             self._playing = asyncio.get_running_loop().create_task(self._run())
+            self.show_line(self._line_shown)
 
     async def _run(self) -> None:
         began = time.monotonic()
@@ -178,12 +225,11 @@ class PathPanel:
 
     def _stopped(self) -> None:
         self._play.label = "Play"
-        if self._line is not None:
-            self._line.visible = True
+        self.show_line(self._line_shown)
 
     async def _save(self) -> None:
         if self.path.keyframes:
-            self._callbacks.download(f"{self._scene.name}-path.json", self.path.to_json().encode())
+            self._callbacks.download(f"{self._scene().name}-path.json", self.path.to_json().encode())
         else:
             self.show_status("Saving needs a keyframe.")
 

@@ -58,6 +58,7 @@ class ViewerFrame:
 
     Attributes:
         image: 8-bit colours.
+        picture: the same without the bars beside a photograph.
         size: rendered (width, height).
         seconds: render time.
         final: whether this is the finest level.
@@ -67,6 +68,7 @@ class ViewerFrame:
     """
 
     image: Picture
+    picture: Picture
     size: tuple[int, int]
     seconds: float
     final: bool
@@ -246,11 +248,13 @@ class ProgressiveRenderer:
             resize_image(picture, (last - first, finest.height))
             for picture, (first, last) in zip(seen.pictures, columns, strict=True)
         ]
+        picture = side_by_side_image(pictures)
         if request.layout == "side by side":
-            picture = side_by_side_image([letterboxed(picture, letterbox) for picture in pictures])
+            image = side_by_side_image([letterboxed(each, letterbox) for each in pictures])
         else:
-            picture = letterboxed(side_by_side_image(pictures), letterbox)
+            image = letterboxed(picture, letterbox)
         return ViewerFrame(
+            image,
             picture,
             (finest.width, finest.height),
             sum(took for _, _, took in latest),
@@ -279,4 +283,4 @@ class ProgressiveRenderer:
             (view.camera.width, view.camera.height) if letterbox is None else (letterbox.camera.width, letterbox.camera.height)
         )
         picture = true_image(view, self.runs[0].scene, size)
-        return ViewerFrame(letterboxed(picture, letterbox), size, 0.0, True, "truth", f"the photograph {view.name}")
+        return ViewerFrame(letterboxed(picture, letterbox), picture, size, 0.0, True, "truth", f"the photograph {view.name}")

@@ -53,6 +53,12 @@ class RenderThread(threading.Thread):
             self._drop(key)
             self._changed.notify_all()
 
+    def at_work(self) -> list[Hashable]:
+        """Keys of the tasks that have finished a slice and wait for nothing but their turn; those in a pause are left out."""
+        with self._changed:
+            now = time.monotonic()
+            return [key for key, entry in self._entries.items() if entry.slices and entry.ready <= now]
+
     def _drop(self, key: Hashable) -> None:
         """Leave the task of a key, which may be running, to `run` to close."""
         if (entry := self._entries.pop(key, None)) is not None:

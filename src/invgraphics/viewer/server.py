@@ -27,6 +27,8 @@ from invgraphics.viewer.shared_state import SharedState
 
 UP = (0.0, 0.0, 1.0)
 """Default up direction of the local frame."""
+HELD = 0.05
+"""Seconds between two looks at whether a reload may go ahead."""
 UP_AGREEMENT = 0.5
 """Cosine of the angle to the photographs' mean up direction above which the default is kept."""
 
@@ -46,10 +48,12 @@ class Address:
     Attributes:
         host: address to listen at; a loopback address is reachable from this machine only.
         port: port, 0 for any that is free.
+        allowed: further names at which browsers reach it, see `HostCheck.allowed`.
     """
 
     host: str
     port: int
+    allowed: tuple[str, ...] = ()
 
 
 class Viewer:
@@ -69,9 +73,11 @@ class Viewer:
         self._runs = runs
         scene = runs[0].scene
         self._worker = RenderThread(self._report_error)
-        self._shared = SharedState(ProgressiveRenderer(runs), self._worker, CameraFrustums(runs[0]), view, max_size)
+        frustums = CameraFrustums(runs[0])
+        self._shared = SharedState(ProgressiveRenderer(runs), self._worker, frustums, view, max_size, upward(scene))
         self._sessions: dict[int, Session] = {}
-        check = HostCheck(address.host)
+        self._reloading = False
+        check = HostCheck(address.host, address.allowed)
         with redirect_stdout(io.StringIO()), check.applied():  # the command prints the address itself
             self._server = LocalServer(address.host, address.port, label=" | ".join(s.name for s in runs), verbose=False)
         if address.port and self._server.get_port() != address.port:  # viser falls back to the next port
@@ -113,23 +119,37 @@ class Viewer:
                 self.reload_if_changed()
 
     def reload_if_changed(self) -> None:
-        """Reload the runs whose checkpoint or scores have changed on disk."""
-        if any(run.has_update() for run in self._runs):
+        """Reload the runs whose checkpoint or scores have changed on disk, once no picture or film of the old ones is made."""
+        if not self._reloading and any(run.has_update() for run in self._runs):
+            self._reloading = True
             self._worker.submit("reload", self._reload())
 
     def _reload(self) -> Task:
-        for run in self._runs:
-            if run.has_update():
-                run.reload()
-        for session in tuple(self._sessions.values()):
-            session.refresh()
-        yield 0.0
+        """Task that loads what is newest after the pictures and films in progress; a camera that moves does not delay it.
+
+        Checkpoints may come faster than pictures: each would end the picture of the one before, and none would be finished.
+        """
+        try:
+            told = False
+            while tasks := {key[0] for key in self._worker.at_work() if isinstance(key, tuple)} & {"frame", "film"}:
+                if "film" in tasks and not told:
+                    told = True
+                    for session in tuple(self._sessions.values()):
+                        session.show_held()
+                yield HELD
+            for run in self._runs:
+                if run.has_update():
+                    run.reload()
+            for session in tuple(self._sessions.values()):
+                session.refresh()
+        finally:
+            self._reloading = False
 
     def _configure_scene(self, scene: Scene) -> None:
         server = self._server
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
-        server.scene.set_up_direction(upward(scene))
+        server.scene.set_up_direction(self._shared.up)
         camera = scene.test[self._shared.start].camera
         first = server.initial_camera  # also where "Reset view" leads
         first.position = camera.position.double().numpy()
