@@ -12,7 +12,8 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from invgraphics.kernels.cuda.runtime import at_least_2, on_device_of, once_differentiable
+from invgraphics.kernels.cuda.runtime import at_least_2, on_device_of
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.reference.composite import OPAQUE
 
 _OPAQUE = tl.constexpr(OPAQUE)

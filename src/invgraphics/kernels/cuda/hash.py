@@ -18,7 +18,8 @@ from torch import Tensor
 
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
-from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of, once_differentiable
+from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.reference.hash import PRIMES
 
 BLOCK = 256

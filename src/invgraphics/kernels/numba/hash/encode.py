@@ -12,10 +12,11 @@ from torch import Tensor
 
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.numba.hash.blocks import TWO, block_at, gather_block, scatter_block
 from invgraphics.kernels.numba.hash.cells import BLOCK, CHUNK, ZERO, locate_block, prefetch_entries
 from invgraphics.kernels.numba.hash.jacobian import encode_jvp, encode_jvp_backward, position_gradient
-from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, threads
+from invgraphics.kernels.numba.runtime import array, index, job_start, parallel, prange, threads
 
 
 @parallel

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from invgraphics.core.lattice import Combination, Lattice
 from invgraphics.kernels import reference
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.numba.lattice.backward import (
     TARGET,
     add_copies,
@@ -36,7 +37,7 @@ from invgraphics.kernels.numba.lattice.pairs import is_pair, multiply_pair
 from invgraphics.kernels.numba.lattice.positions import position_gradient
 from invgraphics.kernels.numba.lattice.rows import interpolate_block
 from invgraphics.kernels.numba.lattice.touched import sparse_rows, touched_rows
-from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, scratch, threads
+from invgraphics.kernels.numba.runtime import array, index, job_start, parallel, prange, scratch, threads
 from invgraphics.kernels.numba.simd.partial import unowned
 
 MOST_ROWS = 2**32 - 1

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from invgraphics.kernels.numba.runtime import array, job_start, once_differentiable, parallel, prange, serial, threads
+from invgraphics.kernels.differentiation import once_differentiable
+from invgraphics.kernels.numba.runtime import array, job_start, parallel, prange, serial, threads
 from invgraphics.kernels.types import Fragments
 
 

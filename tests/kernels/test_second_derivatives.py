@@ -1,0 +1,94 @@
+"""Second derivatives of compiled kernels: right where there are any, an error and never silently zero where there are none."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from invgraphics import kernels
+from invgraphics.core import Camera, Gaussians
+from invgraphics.core.rays import Rays
+from invgraphics.kernels import dispatch
+from invgraphics.kernels.gaussians import gaussian_composites, gaussian_density, gaussian_integrals
+from invgraphics.kernels.meshes import mesh_interpolate
+from invgraphics.kernels.reference.gaussian_rays import precompute
+from invgraphics.kernels.segments import segment_sums
+from invgraphics.kernels.types import Fragments
+
+pytestmark = pytest.mark.skipif("numba" not in dispatch.cpu_implementations(), reason="Numba does not work here")
+RAY = torch.zeros(3, dtype=torch.int64)
+
+
+def rand(*shape: int) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(sum(shape)))
+
+
+def blobs(means: Tensor) -> Gaussians:
+    n = len(means)
+    return Gaussians(means, rand(n, 4) - 0.5, 0.2 * rand(n, 3) + 0.2, 0.8 * rand(n), rand(n, 4, 3))
+
+
+def project(means: Tensor) -> Tensor:
+    camera = Camera(torch.eye(4), torch.full((2,), 20.0), torch.full((2,), 8.0), 16, 16)
+    return kernels.splat_project(blobs(means), camera)[0].conics
+
+
+def rasterise(features: Tensor) -> Tensor:
+    camera = Camera(torch.eye(4), torch.full((2,), 20.0), torch.full((2,), 8.0), 16, 16)
+    with torch.no_grad():
+        footprints, _ = kernels.splat_project(blobs(MEANS), camera)
+    return kernels.splat_rasterise(footprints, features, 16, 16)[0]
+
+
+def interpolate(features: Tensor) -> Tensor:
+    fragments = Fragments(torch.zeros(2, 2, dtype=torch.int64), rand(2, 2, 3), rand(2, 2))
+    return mesh_interpolate(fragments, torch.tensor([[0, 1, 2]]), features)
+
+
+MEANS = rand(5, 3) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
+RAYS = Rays.make(torch.zeros(4, 3), torch.nn.functional.normalize(rand(4, 3) - 0.5 + torch.tensor([0.0, 0.0, 3.0]), dim=1))
+ONCE: dict[str, tuple[Callable[[Tensor], Tensor], Tensor]] = {
+    "composite": (lambda tau: kernels.composite(tau, rand(3, 1), RAY, 1)[1], rand(3)),
+    "ssim": (lambda image: kernels.ssim(image, rand(20, 20, 3) ** 2), rand(20, 20, 3)),
+    "segment sums": (lambda weights: segment_sums(rand(3, 2), weights, RAY, 1), rand(3)),
+    "projection": (project, MEANS),
+    "rasterisation": (rasterise, rand(5, 3)),
+    "mesh": (interpolate, rand(3, 2)),
+    "integrals": (lambda means: gaussian_integrals(precompute(blobs(means), "peak", 1e-3), RAYS, 8), MEANS),
+    "composites": (lambda means: gaussian_composites(precompute(blobs(means), "peak", 1e-3), RAYS, None), MEANS),
+    "density": (lambda means: gaussian_density(blobs(means), MEANS.detach(), None, 1e-3), MEANS),
+}
+
+
+@pytest.mark.parametrize("name", ONCE)
+def test_a_gradient_that_cannot_be_differentiated_says_so(name: str) -> None:
+    """Cotangents are constants here, as those of a sum are, so that torch's own decorator raises nothing."""
+    function, start = ONCE[name]
+    x = start.clone().requires_grad_()
+    (alone,) = torch.autograd.grad(function(x).sum(), x)
+    assert not alone.requires_grad
+    (gradient,) = torch.autograd.grad(function(x).sum(), x, create_graph=True)
+    assert float(alone.abs().max()) > 0
+    assert torch.equal(gradient.detach(), alone)
+    # The other term hid that the first one had no gradient.
+    with pytest.raises(RuntimeError, match=r"no second derivative of .*using\('reference'\)"):
+        (gradient.square().sum() + x.sum()).backward()
+
+
+def test_the_reference_has_the_second_derivative_that_the_message_promises() -> None:
+    function, start = ONCE["composite"]
+    with kernels.using("reference"):
+        x = start.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(function(x).sum(), x, create_graph=True)
+        (second,) = torch.autograd.grad(gradient.square().sum(), x)
+    # Of sum_i c_i (exp(-before) - exp(-after)), by differences of its gradient in float64.
+    c, step = rand(3, 1).double()[:, 0], 1e-5
+
+    def slope(tau: Tensor) -> Tensor:
+        ends = torch.exp(-torch.cat([tau.new_zeros(1), tau.cumsum(0)]))
+        return torch.stack([ends[j + 1] * c[j] - ((ends[:-1] - ends[1:]) * c)[j + 1 :].sum() for j in range(3)])
+
+    tau = start.double()
+    columns = [(slope(tau + step * e).square().sum() - slope(tau - step * e).square().sum()) / (2 * step) for e in torch.eye(3)]
+    torch.testing.assert_close(second.double(), torch.stack(columns), rtol=1e-4, atol=1e-5)
