@@ -77,3 +77,13 @@ def test_points_that_nothing_reaches_have_zeros() -> None:
     sums = gaussian_density(gaussians, mixed, mixed + 1, SMALLEST)
     assert not sums[:3].any()
     assert float(sums[3, 0]) > 0
+
+
+def test_an_eye_at_a_centre_gives_finite_colours() -> None:
+    gaussians, (position, _) = Gaussians(**blobs(40, 1)), points(30, 2)
+    eye = gaussians.means[5].expand(30, 3)
+    position[:9] = gaussians.means[5] + 0.03 * position[:9]
+    found = gaussian_density(gaussians, position, eye, SMALLEST)
+    assert float(found[:9].amin()) > 0
+    with kernels.using("reference"):
+        torch.testing.assert_close(found, gaussian_density(gaussians, position, eye, SMALLEST), atol=1e-5, rtol=1e-4)
