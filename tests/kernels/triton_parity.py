@@ -100,6 +100,24 @@ def edges() -> None:
     assert abs(thin / 9.995e-4 - 1) < 1e-4, "thin media lose their digits"
 
 
+def odd_numbers() -> None:
+    """NaN stays on its ray, a footprint without area has finite gradients, and no second derivative is silently zero."""
+    depth, ray = torch.tensor([0.5, float("nan"), 0.3, 0.2, float("inf"), 0.1]), torch.tensor([0, 0, 0, 1, 1, 2])
+    (ours, _, ends), (theirs, _, _) = (kernels.composite(depth, torch.ones(6, 1), ray, 3) for kernels in (cuda, reference))
+    assert ours.isnan().nonzero().flatten().tolist() == [1, 2]  # the reference loses all rays behind
+    torch.testing.assert_close(ours[0], theirs[0])
+    assert ends.isnan().tolist() == [True, False, False]
+    channels = rand(6, 1).requires_grad_()
+    (gradient,) = torch.autograd.grad(cuda.composite(rand(6), channels, ray, 3)[1].sum(), channels, create_graph=True)
+    assert gradient.requires_grad
+    edge_on = [[0.0, 0.0, 2.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.1, 0.0, 0.1]], [0.9], [[[0.0, 0.0, 0.0]]]
+    leaves = [torch.tensor(values, requires_grad=True) for values in edge_on]
+    view = Camera(torch.eye(4), torch.full((2,), 100.0), torch.full((2,), 32.0), 64, 64)
+    footprints, _ = cuda.splat_project(Gaussians(*leaves), view, 0.3, True)
+    (footprints.conics.sum() + footprints.opacities.sum()).backward()
+    assert all(leaf.grad is not None and bool(leaf.grad.isfinite().all()) for leaf in leaves[:4])
+
+
 def lattices() -> None:
     unit = torch.cat([rand(150, 3) * 1.2 - 0.1, torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 1.0, 0.0]])])
     sparse, one = linked(12), Lattice(randn(1, 4, 1, 3), "zyx")
@@ -234,6 +252,7 @@ CHECKS = {
     "hash": hash_encoding,
     "composite": compositing,
     "edges": edges,
+    "odd": odd_numbers,
     "march": marching,
     "lattices": lattices,
     "splats": splatting,
