@@ -8,8 +8,9 @@ from torch import Tensor
 
 from invgraphics import kernels
 from invgraphics.core import Camera, Gaussians
+from invgraphics.core.ngp import HashGrid
 from invgraphics.core.rays import Rays
-from invgraphics.kernels import dispatch
+from invgraphics.kernels import dispatch, reference
 from invgraphics.kernels.gaussians import gaussian_composites, gaussian_density, gaussian_integrals
 from invgraphics.kernels.meshes import mesh_interpolate
 from invgraphics.kernels.reference.gaussian_rays import precompute
@@ -18,6 +19,7 @@ from invgraphics.kernels.types import Fragments
 
 pytestmark = pytest.mark.skipif("numba" not in dispatch.cpu_implementations(), reason="Numba does not work here")
 RAY = torch.zeros(3, dtype=torch.int64)
+GRID = HashGrid(levels=4, features=2, log2_size=8, base=2, finest=30)
 
 
 def rand(*shape: int) -> Tensor:
@@ -92,3 +94,38 @@ def test_the_reference_has_the_second_derivative_that_the_message_promises() -> 
     tau = start.double()
     columns = [(slope(tau + step * e).square().sum() - slope(tau - step * e).square().sum()) / (2 * step) for e in torch.eye(3)]
     torch.testing.assert_close(second.double(), torch.stack(columns), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("features", [2, 3])
+def test_the_gradient_of_hash_encoded_positions_is_differentiable_in_them(features: int) -> None:
+    grid = HashGrid(levels=4, features=features, log2_size=8, base=2, finest=30)
+    unit, table = rand(50, 3) * 1.2 - 0.1, rand(grid.entries, features) - 0.5
+    cotangent, along = rand(50, grid.levels * features) - 0.5, rand(50, 3) - 0.5
+    x = unit.clone().requires_grad_()
+    encoded, _ = kernels.hash_encode(x, table.clone().requires_grad_(), grid)
+    (slope,) = torch.autograd.grad(encoded, x, cotangent, create_graph=True)
+    (found,) = torch.autograd.grad(slope, x, along)
+    # Trilinear within a cell: central differences of the Jacobian in float64 are exact.
+    step, columns = 1e-7, []
+    for axis in torch.eye(3, dtype=torch.float64):
+        ends = [reference.hash_encode(unit.double() + s * axis, table.double(), grid, jacobian=True)[1] for s in (step, -step)]
+        assert ends[0] is not None and ends[1] is not None
+        columns.append(torch.einsum("mfa,mf,ma->m", (ends[0] - ends[1]) / (2 * step), cotangent.double(), along.double()))
+    expected = torch.stack(columns, dim=1)
+    assert float(expected.abs().max()) > 1
+    inside = ((unit > 1e-3) & (unit < 1 - 1e-3)).all(dim=1)
+    torch.testing.assert_close(found.double()[inside], expected[inside], rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+    assert not found[(unit < 0) | (unit > 1)].any()
+
+
+def test_the_gradient_of_a_hash_table_is_differentiable_in_all_it_depends_on() -> None:
+    unit, table, weights = (rand(40, 3) * 0.9 + 0.05, rand(GRID.entries, 2) - 0.5, rand(40, GRID.levels * 2))
+
+    def second(dtype: torch.dtype) -> tuple[Tensor, ...]:
+        u, t, w = (x.to(dtype).clone().requires_grad_() for x in (unit, table, weights))
+        (slope,) = torch.autograd.grad(kernels.hash_encode(u, t, GRID)[0].square(), t, w, create_graph=True)
+        return torch.autograd.grad(slope.square().sum(), (u, t, w))
+
+    for found, expected in zip(second(torch.float32), second(torch.float64), strict=True):
+        assert float(expected.abs().max()) > 0.1
+        torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))

@@ -45,8 +45,10 @@ def hash_encode(
         jacobian: whether to return d features / d unit as well.
 
     Returns:
-        Features (m, levels * f), differentiable in ``table`` and ``unit``, the gradient along ``unit`` once more in ``table``;
-        and the Jacobian, differentiable in ``table``.
+        Features (m, levels * f), differentiable twice in ``table`` and ``unit``; and the Jacobian, differentiable in ``table``.
+
+    Raises:
+        ValueError: positions that are no (m, 3), or a table of another number of entries.
     """
     checks.check_columns(3, unit=unit)
     checks.check_table(table, grid)
