@@ -28,7 +28,7 @@ def gaussian_integrals(primitives: Primitives, rays: Rays, steps: int, extra: in
         extra: columns after alpha and colour: 0, 1 (distance) or 4 (and the normal).
 
     Returns:
-        (n, 4 + extra), differentiable in the primitives and in the rays.
+        (n, 4 + extra), differentiable in the primitives and in the rays' origins and directions.
     """
     return choose("gaussian_integrals", *_tensors(primitives), *checked_rays(rays))(primitives, rays, steps, extra)
 
@@ -46,7 +46,7 @@ def gaussian_composites(primitives: Primitives, rays: Rays, axes: Tensor | None,
         extra: as of `gaussian_integrals`.
 
     Returns:
-        (n, 4 + extra), differentiable in the primitives and in the rays.
+        (n, 4 + extra), differentiable in the primitives and in the rays' origins and directions, the order being fixed.
     """
     if axes is not None and axes.ndim > 1:
         check_rows("rays", len(rays), axes=axes)
