@@ -8,9 +8,11 @@ from torch import Tensor
 
 from invgraphics import kernels
 from invgraphics.core import Camera, Gaussians
+from invgraphics.core.lattice import Lattice
 from invgraphics.core.ngp import HashGrid
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import dispatch, reference
+from invgraphics.kernels.differentiation import gradients_of_positions
 from invgraphics.kernels.gaussians import gaussian_composites, gaussian_density, gaussian_integrals
 from invgraphics.kernels.meshes import mesh_interpolate
 from invgraphics.kernels.reference.gaussian_rays import precompute
@@ -20,6 +22,7 @@ from invgraphics.kernels.types import Fragments
 pytestmark = pytest.mark.skipif("numba" not in dispatch.cpu_implementations(), reason="Numba does not work here")
 RAY = torch.zeros(3, dtype=torch.int64)
 GRID = HashGrid(levels=4, features=2, log2_size=8, base=2, finest=30)
+PLANES = "xy", "xz", "yz"
 
 
 def rand(*shape: int) -> Tensor:
@@ -129,3 +132,49 @@ def test_the_gradient_of_a_hash_table_is_differentiable_in_all_it_depends_on() -
     for found, expected in zip(second(torch.float32), second(torch.float64), strict=True):
         assert float(expected.abs().max()) > 0.1
         torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+
+
+def encoded(kind: str, unit: Tensor, table: Tensor) -> Tensor:
+    if kind == "hash":
+        return kernels.hash_encode(unit, table, GRID)[0]
+    rows = table.reshape(3, -1, 4)
+    planes, lines = rows[:, :36].reshape(3, 6, 6, 4), rows[:, :6]
+    if kind == "planes":
+        return kernels.lattice_encode(unit, [Lattice(x, axes) for x, axes in zip(planes, PLANES, strict=True)], "sum")
+    pairs = zip(planes, PLANES, lines, "zyx", strict=True)
+    return kernels.lattice_encode(unit, [Lattice(x, a) for p, a, q, b in pairs for x, a in ((p, a), (q, b))], "vm")
+
+
+@pytest.mark.parametrize("kind", ["hash", "planes", "vm"])
+def test_vector_jacobian_products_in_positions_are_those_of_ordinary_gradients(kind: str) -> None:
+    """And theirs in table and cotangent: what a loss on normals takes."""
+    unit, table = rand(300, 3), rand(GRID.entries if kind == "hash" else 660, 2) - 0.5
+
+    def run(alone: bool, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        u, t = unit.to(dtype).clone().requires_grad_(), table.to(dtype).clone().requires_grad_()
+        if alone:
+            with gradients_of_positions():
+                out = encoded(kind, u, t)
+        else:
+            out = encoded(kind, u, t)
+        cotangent = rand(*out.shape).to(dtype).requires_grad_()
+        (slope,) = torch.autograd.grad(out, u, cotangent, create_graph=True)
+        return slope, *torch.autograd.grad((slope * rand(300, 3).to(dtype)).square().sum(), (t, cotangent))
+
+    for found, same, expected in zip(
+        run(True, torch.float32), run(False, torch.float32), run(False, torch.float64), strict=True
+    ):
+        scale = float(expected.detach().abs().max())
+        assert scale > 0.01
+        assert (found - same).abs().max() <= 1e-6 * scale
+        assert (found - expected).abs().max() <= 1e-5 * scale
+
+
+def test_the_mode_ends_with_its_block_and_is_one_threads_own() -> None:
+    table = (rand(GRID.entries, 2)).requires_grad_()
+    with gradients_of_positions():
+        moving = rand(5, 3).requires_grad_()
+        out = encoded("hash", moving, table)
+    again = encoded("hash", moving, table)
+    assert torch.autograd.grad(out.sum(), table, allow_unused=True)[0] is None
+    assert torch.autograd.grad(again.sum(), table)[0].any()

@@ -1,9 +1,11 @@
-"""What compiled operations share in autograd: errors instead of wrong second derivatives."""
+"""What compiled operations share in autograd: errors instead of wrong second derivatives, and gradients of positions alone."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -49,3 +51,29 @@ def once_differentiable(backward: Backward) -> Backward:
         )
 
     return wrapped
+
+
+class _Mode(threading.local):
+    positions_only = False
+
+
+_mode = _Mode()
+
+
+@contextmanager
+def gradients_of_positions() -> Iterator[None]:
+    """Encode for vector-Jacobian products in positions: features from inside the block have no other gradient.
+
+    That product is in turn differentiable in tables and cotangents, not in positions. Without this, compiled encodings compute
+    the gradients of tables too wherever these require one, as autograd does not tell them what is asked for.
+    """
+    before, _mode.positions_only = _mode.positions_only, True
+    try:
+        yield
+    finally:
+        _mode.positions_only = before
+
+
+def positions_only() -> bool:
+    """Whether this thread is inside `gradients_of_positions`."""
+    return _mode.positions_only

@@ -19,7 +19,7 @@ from torch import Tensor
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
 from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of
-from invgraphics.kernels.differentiation import once_differentiable
+from invgraphics.kernels.differentiation import once_differentiable, positions_only
 from invgraphics.kernels.reference.hash import PRIMES
 
 BLOCK = 256
@@ -136,15 +136,17 @@ class _Encode(torch.autograd.Function):
             with on_device_of(table):
                 encode[(blocks(len(unit), BLOCK), grid.levels)](unit, table, levels, out, *sizes)
         ctx.save_for_backward(unit, table)
-        ctx.grid = grid
+        ctx.grid, ctx.positions_only = grid, positions_only()
         return out
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         unit, table = ctx.saved_tensors
         gradient = grad_outputs[0].contiguous()
+        wants_table = ctx.needs_input_grad[1] and not ctx.positions_only
+        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if wants_table else None
+        unit = unit.detach() if ctx.positions_only else unit
         grad_unit = _PositionGradient.apply(unit, table, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
-        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if ctx.needs_input_grad[1] else None
         return grad_unit, grad_table, None
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
-from invgraphics.kernels.differentiation import once_differentiable
+from invgraphics.kernels.differentiation import once_differentiable, positions_only
 from invgraphics.kernels.numba.hash.blocks import TWO, block_at, gather_block, scatter_block
 from invgraphics.kernels.numba.hash.cells import BLOCK, CHUNK, ZERO, locate_block, prefetch_entries
 from invgraphics.kernels.numba.hash.jacobian import encode_jvp, encode_jvp_backward, hessian_product, position_gradient
@@ -79,15 +79,17 @@ class _Encode(torch.autograd.Function):
         out = unit.new_empty(len(unit), grid.levels * width)
         encode(_by_axis(unit), array(table).reshape(-1), index(width), *levels_of(grid), threads(), out.numpy())
         ctx.save_for_backward(unit, table)
-        ctx.grid = grid
+        ctx.grid, ctx.positions_only = grid, positions_only()
         return out
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         (gradient,) = grad_outputs
         unit, table = ctx.saved_tensors
+        wants_table = ctx.needs_input_grad[1] and not ctx.positions_only
+        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if wants_table else None
+        unit = unit.detach() if ctx.positions_only else unit
         grad_unit = _PositionGradient.apply(unit, table, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
-        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if ctx.needs_input_grad[1] else None
         return grad_unit, grad_table, None
 
 
