@@ -36,3 +36,23 @@ def test_large_blocks_are_used_again() -> None:
 def test_where_there_is_nothing_to_set_it_says_no(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ctypes.CDLL", lambda name: object())
     assert not keep_freed_memory()
+
+
+@pytest.mark.parametrize(("largest", "expected"), [(2**30, [(-3, 2**30), (-1, 2**31 - 1)]),
+                                                   (2**25, [(-3, 2**30), (-3, 2**25), (-1, 2**31 - 1)]),
+                                                   (2**24, [(-3, 2**30), (-3, 2**25)])])  # fmt: skip
+def test_the_largest_blocks_that_are_accepted_are_kept(
+    monkeypatch: pytest.MonkeyPatch, largest: int, expected: list[tuple[int, int]]
+) -> None:
+    """Where none are, nothing is set: a trim threshold alone would end the automatic choice of both."""
+    calls: list[tuple[int, int]] = []
+
+    class Library:
+        @staticmethod
+        def mallopt(setting: int, value: int) -> int:
+            calls.append((setting, value))
+            return int(setting != -3 or value <= largest)
+
+    monkeypatch.setattr("ctypes.CDLL", lambda name: Library())
+    assert keep_freed_memory() == (largest > 2**24)
+    assert calls == expected

@@ -97,3 +97,17 @@ def test_compiled_pictures_and_marches_scale_densities_alike() -> None:
     assert off.sum() <= 0.02 * len(rays)
     ours, theirs = (kernels.ngp_march(rays, occupied, bounds, steps, field, rays.near, 0.3) for kernels in (numba, reference))
     alike(ours, theirs, len(rays))
+
+
+def test_uniform_steps_in_a_box_skip_empty_space_without_losing_any() -> None:
+    """Steps that grow with the way from the middle are no lattice, along which empty cells could be skipped by counting."""
+    bounds, rays = single(*setting(rays=100))
+    bounds = replace(bounds, space="box", lo=bounds.lo * 6, hi=bounds.hi * 6)
+    rays = bounds.clip(Rays.make(rays.origins * 2, rays.directions))
+    occupied = torch.rand(16, 16, 16, generator=torch.Generator().manual_seed(0)) < 0.02
+    ours, theirs = (kernels.ray_march(rays, occupied, bounds, STEPS, rays.near) for kernels in (numba, reference))
+    assert len(theirs.ray) > 100
+    counts = [torch.bincount(march.ray, minlength=len(rays)) for march in (ours, theirs)]
+    same = counts[0] == counts[1]
+    assert float(same.float().mean()) > 0.95
+    torch.testing.assert_close(ours.t0[same[ours.ray]], theirs.t0[same[theirs.ray]], rtol=1e-4, atol=1e-4)

@@ -30,7 +30,7 @@ def words_of(script: str, **environment: str) -> list[str]:
 
 
 def test_interpreted_kernels_equal_the_reference() -> None:
-    checks = ["hash", "composite", "edges", "march", "lattices", "splats", "projection"]
+    checks = ["hash", "composite", "edges", "odd", "march", "lattices", "splats", "projection"]
     assert words_of("triton_parity.py", TRITON_INTERPRET="1") == checks
 
 

@@ -169,3 +169,16 @@ def test_nothing_to_see() -> None:
     assert sums.shape == (0, 4) and alpha.shape == (0,)
     sums, alpha = numba.lattice_render(rays, torch.zeros_like(occupied), bounds, STEPS, vm())
     assert float(sums.abs().sum() + alpha.sum()) == 0
+
+
+def test_a_crop_leaves_the_contraction_of_densities_to_the_bounds() -> None:
+    bounds, rays, occupied = setting("contracted")
+    corner = torch.tensor([0.2, 0.15, 0.1]).tolist(), torch.tensor([0.8, 0.9, 0.95]).tolist()
+    field = replace(cp(), crop=tuple(map(tuple, corner)))
+    steps = replace(STEPS, contracted=True)
+    exact_rays, exact_bounds = doubled(bounds, rays)
+    exact_sums, exact = reference.lattice_render(exact_rays, occupied, exact_bounds, steps, in_float64(field))
+    sums, alpha = numba.lattice_render(rays, occupied, bounds, steps, field)
+    assert 0.1 < float(exact.mean()) < 0.99
+    off = ((alpha - exact).abs() > 2e-5) | ((sums - exact_sums).abs() > 2e-5 * exact_sums.abs().max()).any(dim=1)
+    assert off.sum() <= 0.02 * len(rays)

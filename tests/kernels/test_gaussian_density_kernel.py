@@ -77,3 +77,28 @@ def test_points_that_nothing_reaches_have_zeros() -> None:
     sums = gaussian_density(gaussians, mixed, mixed + 1, SMALLEST)
     assert not sums[:3].any()
     assert float(sums[3, 0]) > 0
+
+
+@pytest.mark.parametrize("implementation", kernels.dispatch.cpu_implementations())
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_position_that_is_not_finite_leaves_the_others_their_densities(implementation: str, value: float) -> None:
+    gaussians, (position, eye) = Gaussians(**blobs(40, 1)), points(30, 2)
+    with kernels.using(implementation):
+        expected = gaussian_density(gaussians, position, eye, SMALLEST)
+        position[[3, 17], [0, 2]] = value
+        found = gaussian_density(gaussians, position, eye, SMALLEST)
+        assert not gaussian_density(gaussians, torch.full((2, 3), value), eye[:2], SMALLEST).any()
+    others = torch.tensor([i for i in range(30) if i not in (3, 17)])
+    assert float(expected[others].abs().max()) > 0.1
+    torch.testing.assert_close(found[others], expected[others])
+    assert not found[[3, 17]].any()
+
+
+def test_an_eye_at_a_centre_gives_finite_colours() -> None:
+    gaussians, (position, _) = Gaussians(**blobs(40, 1)), points(30, 2)
+    eye = gaussians.means[5].expand(30, 3)
+    position[:9] = gaussians.means[5] + 0.03 * position[:9]
+    found = gaussian_density(gaussians, position, eye, SMALLEST)
+    assert float(found[:9].amin()) > 0
+    with kernels.using("reference"):
+        torch.testing.assert_close(found, gaussian_density(gaussians, position, eye, SMALLEST), atol=1e-5, rtol=1e-4)

@@ -199,3 +199,25 @@ def test_thin_gaussians_hide_each_other_before_a_distant_one(width: float, offse
         exact = gaussian_integrals(primitives, rays, 32)
     assert float((exact[:, 1] / exact[:, 0]).max()) < 0.9
     torch.testing.assert_close(fast, exact, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("name", ["integrals", "composites"])
+def test_a_camera_at_a_gaussians_centre_sees_its_mean_colour(name: str, moving: bool) -> None:
+    """No direction leads there: the vector of length 0 is normalised to itself, as torch does it."""
+
+    def run(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+        gaussians = blobs(12, 4)
+        tensors = {key: value.to(dtype).clone().requires_grad_() for key, value in vars(gaussians).items()}
+        origins = gaussians.means[3].to(dtype).expand(6, 3).clone().requires_grad_(moving)
+        directions = torch.nn.functional.normalize(
+            torch.randn(6, 3, generator=torch.Generator().manual_seed(2)).to(dtype), dim=1
+        )
+        primitives, rays = precompute(Gaussians(**tensors), "peak", SMALLEST), Rays.make(origins, directions)
+        kernel = gaussian_integrals if name == "integrals" else gaussian_composites
+        light = kernel(primitives, rays, 16) if name == "integrals" else kernel(primitives, rays, None)
+        return light.detach(), *torch.autograd.grad(light.square().sum(), [tensors["opacities"], tensors["sh"]])
+
+    for found, expected in zip(run(torch.float32), run(torch.float64), strict=True):
+        assert float(expected.abs().max()) > 0.1
+        torch.testing.assert_close(found.double(), expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))

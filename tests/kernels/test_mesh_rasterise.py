@@ -159,3 +159,21 @@ def test_nothing_to_see(name: str) -> None:
         assert bool((found.face == -1).all())
         assert bool(found.depth.isinf().all())
         assert not bool(found.barycentric.any())
+
+
+@pytest.mark.parametrize("corner", [-1, 3, 100_000])
+@pytest.mark.parametrize("name", IMPLEMENTATIONS)
+def test_corners_that_are_no_vertices_are_refused(name: str, corner: int) -> None:
+    if name == "reference" and corner == -1:
+        pytest.skip("torch counts negative indices from the end")
+    vertices, faces = torch.tensor([[-0.5, -0.5, 2.0], [0.5, -0.5, 2.0], [0.0, 0.5, 2.0]]), torch.tensor([[0, 1, corner]])
+    camera = Camera(torch.eye(4), torch.full((2,), 20.0), torch.full((2,), 8.0), 16, 16)
+    with kernels.using(name):
+        fragments = kernels.mesh_rasterise(vertices, torch.tensor([[0, 1, 2]]), camera)
+        assert bool((fragments.face == 0).any())
+        with pytest.raises(IndexError):
+            kernels.mesh_rasterise(vertices, faces, camera)
+        with pytest.raises(IndexError):
+            kernels.mesh_interpolate(fragments, faces, torch.rand(3, 2))
+        with pytest.raises(IndexError):
+            kernels.mesh_interpolate(replace(fragments, face=fragments.face + 1), torch.tensor([[0, 1, 2]]), torch.rand(3, 2))

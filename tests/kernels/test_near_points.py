@@ -1,5 +1,8 @@
 """Nearest points within a radius equal those of scipy's k-d tree, in every implementation."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -50,3 +53,36 @@ def test_ties_go_to_the_lower_index_and_nothing_gives_nothing(implementation: st
     assert bool((none == -1).all())
     assert bool(far.isinf().all())
     assert empty.shape == (0, 3)
+
+
+CRASH = """
+import torch
+from invgraphics.kernels.near import near_points
+generator = torch.Generator().manual_seed(0)
+points, position = torch.rand(200, 3, generator=generator), torch.rand(50, 3, generator=generator)
+for value in (torch.nan, torch.inf, -torch.inf, 1e30, -3e38):
+    points[3, 0], position[7, 1] = value, value
+    points[5] = position[5] = torch.full((3,), 2e38)
+    index, squared = near_points(position, points, 4, 0.3)
+    print(*index.flatten().tolist(), float(squared[squared.isfinite()].sum()))
+"""
+
+
+@pytest.mark.skipif("numba" not in IMPLEMENTATIONS, reason="Numba does not work here")
+def test_points_that_are_not_finite_or_far_away_disturb_no_others() -> None:
+    """In a process of its own: foreign memory was written. A point far beyond the others is near itself."""
+    done = subprocess.run([sys.executable, "-c", CRASH], capture_output=True, text=True, check=False, timeout=400)
+    assert done.returncode == 0, done.stderr[-2000:]
+    lines = iter(done.stdout.splitlines())
+    generator = torch.Generator().manual_seed(0)
+    points, position = (torch.rand(n, 3, generator=generator).double().numpy() for n in (200, 50))
+    for value in (np.nan, np.inf, -np.inf, 1e30, -3e38):
+        points[3, 0], position[7, 1] = value, value
+        points[5] = position[5] = np.float32(2e38)
+        difference = position[:, None] - points
+        squared = np.where(np.isfinite(difference).all(axis=2), (difference**2).sum(axis=2), np.inf)
+        order = np.argsort(squared, axis=1, kind="stable")[:, :4]
+        found = np.take_along_axis(squared, order, axis=1) <= 0.3**2
+        *index, total = next(lines).split()
+        np.testing.assert_array_equal(np.array(index, int).reshape(50, 4), np.where(found, order, -1))
+        assert float(total) == pytest.approx(np.take_along_axis(squared, order, axis=1)[found].sum(), rel=1e-4)

@@ -248,3 +248,20 @@ def test_disc_gradients_by_finite_differences() -> None:
         return (reference.splat_rasterise(footprints, rgb, *SIZE)[1] * probe).sum()
 
     assert torch.autograd.gradcheck(render, leaves, eps=1e-8, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("scales", [(0.1, 0.0, 0.1), (0.1, 1e-12, 0.1), (0.1, 0.0, 0.0), (0.1, 1e-22, 1e-22)])
+def test_compensated_gradients_stay_finite_where_a_footprint_has_no_area(scales: tuple[float, float, float]) -> None:
+    """Seen edge-on: the compensation is at its lower bound, and a constant."""
+
+    def gradients(kernels, dtype: torch.dtype) -> list[torch.Tensor]:
+        view = Camera(*(x.to(dtype) for x in (torch.eye(4), torch.full((2,), 100.0), torch.full((2,), 32.0))), 64, 64)
+        values = [[[0.0, 0.0, 2.0]], [[1.0, 0.0, 0.0, 0.0]], [list(scales)], [0.9], [[[0.0, 0.0, 0.0]]]]
+        leaves = [torch.tensor(value, dtype=dtype, requires_grad=True) for value in values]
+        footprints, _ = kernels.splat_project(Gaussians(*leaves), view, 0.3, True)
+        assert float(footprints.radii) > 0
+        total = footprints.means2d.sum() + footprints.conics.sum() + footprints.opacities.sum()
+        return list(torch.autograd.grad(total, leaves[:4]))
+
+    for found, expected in zip(gradients(numba, torch.float32), gradients(reference, F64), strict=True):
+        torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)

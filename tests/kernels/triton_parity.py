@@ -86,8 +86,9 @@ def edges() -> None:
         places = torch.linspace(0.1, 0.9, 12).reshape(3, 4).T.to(dtype).requires_grad_()
         entries = table.detach().to(dtype).T.contiguous().T.requires_grad_()  # both column by column in memory
         (slope,) = torch.autograd.grad(kernels.hash_encode(places, entries, grid)[0].square().sum(), places, create_graph=True)
-        slopes.append(torch.autograd.grad(slope.square().sum(), entries)[0])
-    assert (slopes[0] - slopes[1]).abs().max() <= 1e-5 * slopes[1].abs().max()
+        slopes.append(torch.autograd.grad(slope.square().sum(), (entries, places)))
+    for ours, theirs in zip(*slopes, strict=True):
+        assert (ours - theirs).abs().max() <= 1e-5 * theirs.abs().max()
     points = rand(5, 3)
     ours, theirs = (kernels.hash_encode(points, table, grid, True) for kernels in (cuda, reference))
     assert torch.equal(ours[0], theirs[0])
@@ -98,6 +99,24 @@ def edges() -> None:
     ray, depth = torch.zeros(1000, dtype=torch.int64), torch.full((1000,), 1e-6)
     thin = cuda.composite(depth, torch.ones(1000, 1), ray, 1)[2].item()
     assert abs(thin / 9.995e-4 - 1) < 1e-4, "thin media lose their digits"
+
+
+def odd_numbers() -> None:
+    """NaN stays on its ray, a footprint without area has finite gradients, and no second derivative is silently zero."""
+    depth, ray = torch.tensor([0.5, float("nan"), 0.3, 0.2, float("inf"), 0.1]), torch.tensor([0, 0, 0, 1, 1, 2])
+    (ours, _, ends), (theirs, _, _) = (kernels.composite(depth, torch.ones(6, 1), ray, 3) for kernels in (cuda, reference))
+    assert ours.isnan().nonzero().flatten().tolist() == [1, 2]  # the reference loses all rays behind
+    torch.testing.assert_close(ours[0], theirs[0])
+    assert ends.isnan().tolist() == [True, False, False]
+    channels = rand(6, 1).requires_grad_()
+    (gradient,) = torch.autograd.grad(cuda.composite(rand(6), channels, ray, 3)[1].sum(), channels, create_graph=True)
+    assert gradient.requires_grad
+    edge_on = [[0.0, 0.0, 2.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.1, 0.0, 0.1]], [0.9], [[[0.0, 0.0, 0.0]]]
+    leaves = [torch.tensor(values, requires_grad=True) for values in edge_on]
+    view = Camera(torch.eye(4), torch.full((2,), 100.0), torch.full((2,), 32.0), 64, 64)
+    footprints, _ = cuda.splat_project(Gaussians(*leaves), view, 0.3, True)
+    (footprints.conics.sum() + footprints.opacities.sum()).backward()
+    assert all(leaf.grad is not None and bool(leaf.grad.isfinite().all()) for leaf in leaves[:4])
 
 
 def lattices() -> None:
@@ -234,6 +253,7 @@ CHECKS = {
     "hash": hash_encoding,
     "composite": compositing,
     "edges": edges,
+    "odd": odd_numbers,
     "march": marching,
     "lattices": lattices,
     "splats": splatting,

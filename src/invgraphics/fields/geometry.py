@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from invgraphics.kernels.differentiation import gradients_of_positions
 
 CPU_CHUNK = 8192
 """Samples that go through the networks at once on a CPU: larger activations cost more in page faults than in arithmetic."""
@@ -52,7 +55,9 @@ def query_geometry(
         moving = position
         if with_gradient and not (training and position.requires_grad):
             moving = position.detach().requires_grad_()
-        features = followed = encode(moving)
+        # Positions that a loss may move need second derivatives; of others the first ones alone are asked for.
+        with nullcontext() if moving is position else gradients_of_positions():
+            features = followed = encode(moving)
         if training and moving is not position:
             # Encoded again: backward would spend more on a gradient in these positions, which is not needed.
             again = encode(position)

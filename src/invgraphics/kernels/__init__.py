@@ -15,7 +15,7 @@ from invgraphics.core.bounds import Bounds
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.core.rays import Rays
-from invgraphics.kernels import types
+from invgraphics.kernels import checks, types
 from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.dispatch import compiled as compiled
 from invgraphics.kernels.dispatch import in_use as in_use
@@ -45,10 +45,14 @@ def hash_encode(
         jacobian: whether to return d features / d unit as well.
 
     Returns:
-        Features (m, levels * f), differentiable in ``table`` and ``unit``, the gradient along ``unit`` once more in ``table``;
-        and the Jacobian, differentiable in ``table``.
+        Features (m, levels * f), differentiable twice in ``table`` and ``unit``; and the Jacobian, differentiable in ``table``.
+
+    Raises:
+        ValueError: positions that are no (m, 3), or a table of another number of entries.
     """
-    return choose("hash_encode", unit)(unit, table, grid, jacobian)
+    checks.check_columns(3, unit=unit)
+    checks.check_table(table, grid)
+    return choose("hash_encode", unit, table)(unit, table, grid, jacobian)
 
 
 def adam_rows(
@@ -75,7 +79,8 @@ def adam_rows(
         rows: which rows ``gradient`` has, each once, int64, in the order of memory; all others keep value and moments.
             ``None`` for all.
     """
-    choose("adam_rows", values)(values, gradient, moments, step, rates, rows)
+    checks.check_adam(values, gradient, moments, rates, rows)
+    choose("adam_rows", values, gradient, *moments)(values, gradient, moments, step, rates, rows)
 
 
 def ray_march(
@@ -93,7 +98,8 @@ def ray_march(
     Returns:
         Packed intervals, sorted by ray and distance. Not differentiable.
     """
-    return choose("ray_march", rays.origins)(rays, occupied, bounds, steps, start)
+    checks.check_cube(occupied)
+    return choose("ray_march", *checks.checked_rays(rays, start))(rays, occupied, bounds, steps, start)
 
 
 def ngp_march(
@@ -119,7 +125,11 @@ def ngp_march(
     Returns:
         Packed intervals, sorted by ray and distance. Not differentiable.
     """
-    return choose("ngp_march", rays.origins)(rays, occupied, bounds, steps, field, start, min_transmittance)
+    checks.check_cube(occupied)
+    checks.check_table(field.table, field.grid)
+    return choose("ngp_march", *checks.checked_rays(rays, start), field.table)(
+        rays, occupied, bounds, steps, field, start, min_transmittance
+    )
 
 
 def ngp_render(
@@ -148,7 +158,10 @@ def ngp_render(
     Returns:
         Sums of w * (radiance, distance), and of w, per ray (see `composite`).
     """
-    return choose("ngp_render", rays.origins)(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
+    checks.check_cube(occupied)
+    checks.check_table(field.table, field.grid)
+    render = choose("ngp_render", *checks.checked_rays(rays), field.table)
+    return render(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
 
 
 def composite(
@@ -164,8 +177,12 @@ def composite(
 
     Returns:
         Weights w_i; sums over each ray of w_i * channels_i; alpha = sum of w_i. Differentiable in the first two arguments.
+
+    Raises:
+        ValueError: rows of channels or ray indices that are not as many as optical depths.
     """
-    return choose("composite", optical_depth)(optical_depth, channels, ray, rays)
+    checks.check_rows("samples", len(optical_depth), channels=channels, ray=ray)
+    return choose("composite", optical_depth, channels)(optical_depth, channels, ray, rays)
 
 
 def splat_project(
@@ -182,7 +199,8 @@ def splat_project(
     Returns:
         Conic footprints, culled where what is opaquer than 1/255 misses the frustum; and rgb = max(0, SH(direction) + 0.5).
     """
-    return choose("splat_project", gaussians.means)(gaussians, camera, dilation, antialiased)
+    checks.check_gaussians(gaussians)
+    return choose("splat_project", *vars(gaussians).values())(gaussians, camera, dilation, antialiased)
 
 
 def splat_project_discs(
@@ -198,12 +216,13 @@ def splat_project_discs(
     Returns:
         Disc footprints, whose response is taken where a pixel's ray meets the disc; and colours as in `splat_project`.
     """
-    return choose("splat_project_discs", gaussians.means)(gaussians, camera, dilation)
+    checks.check_gaussians(gaussians)
+    return choose("splat_project_discs", *vars(gaussians).values())(gaussians, camera, dilation)
 
 
 def splat_bin(footprints: types.Footprints, width: int, height: int, tile: int) -> types.Bins:
     """Tile intersection and depth sort: per tile, front to back, the footprints whose square overlaps it. No gradient."""
-    return choose("splat_bin", footprints.means2d)(footprints, width, height, tile)
+    return choose("splat_bin", *vars(footprints).values())(footprints, width, height, tile)
 
 
 def splat_rasterise(
@@ -234,7 +253,9 @@ def splat_rasterise(
     """
     if not features.shape[1]:
         raise ValueError("Features need at least one channel.")
-    return choose("splat_rasterise", footprints.means2d)(footprints, features, width, height, tile, max_grad_splats)
+    checks.check_rows("footprints", len(footprints), features=features)
+    rasterise = choose("splat_rasterise", *vars(footprints).values(), features)
+    return rasterise(footprints, features, width, height, tile, max_grad_splats)
 
 
 def splat_median(footprints: types.Footprints, width: int, height: int, tile: int | None = None) -> Float[Tensor, "h w"]:
@@ -242,12 +263,17 @@ def splat_median(footprints: types.Footprints, width: int, height: int, tile: in
 
     Not differentiable. Arguments as in `splat_rasterise`.
     """
-    return choose("splat_median", footprints.means2d)(footprints, width, height, tile)
+    return choose("splat_median", *vars(footprints).values())(footprints, width, height, tile)
 
 
 def ssim(image: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
     """Mean SSIM, differentiable (Wang et al. 2004; 11x11 Gaussian window, sigma 1.5, zero-padded as in 3DGS).
 
     Values in [0, 1] are assumed (data range 1). Differentiable in ``image``.
+
+    Raises:
+        ValueError: images of two shapes.
     """
-    return choose("ssim", image)(image, target)
+    if image.ndim != 3 or image.shape != target.shape:
+        raise ValueError(f"Images have one shape (h, w, c), not {tuple(image.shape)} and {tuple(target.shape)}.")
+    return choose("ssim", image, target)(image, target)

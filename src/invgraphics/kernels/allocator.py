@@ -6,7 +6,8 @@ import ctypes
 
 # Numbers and meaning: mallopt(3).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-_LARGEST = {_TRIM_THRESHOLD: 2**31 - 1, _MMAP_THRESHOLD: 2**30}
+_LARGEST_TRIM, _LARGEST_BLOCKS = 2**31 - 1, (2**30, 2**25)
+"""Thresholds, largest first: older versions of glibc refuse blocks above 32 MiB."""
 
 
 def keep_freed_memory() -> bool:
@@ -21,7 +22,10 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return False
-    return all(mallopt(setting, value) == 1 for setting, value in _LARGEST.items())
+    # Any setting ends the automatic choice of both thresholds, so that a trim threshold alone would make things worse.
+    if not any(mallopt(_MMAP_THRESHOLD, size) == 1 for size in _LARGEST_BLOCKS):
+        return False
+    return mallopt(_TRIM_THRESHOLD, _LARGEST_TRIM) == 1
 
 
 def return_freed_memory() -> bool:

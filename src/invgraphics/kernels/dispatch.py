@@ -74,17 +74,23 @@ def cpu_implementations() -> tuple[str, ...]:
     return tuple(name for name in IMPLEMENTATIONS if DEVICES.get(name, "cpu") == "cpu" and not unavailable_reason(name))
 
 
-def choose(operation: str, like: torch.Tensor) -> Any:
-    """The function that runs ``operation`` for tensors like ``like``.
+def choose(operation: str, like: torch.Tensor, *others: torch.Tensor | None) -> Any:
+    """The function that runs ``operation`` for tensors like ``like`` and ``others``.
 
-    Compiled kernels are written for float32 on one kind of device; everything else runs on the plain torch reference.
+    Compiled kernels are written for float32 on one kind of device; everything else, mixed dtypes included, runs on the plain
+    torch reference.
     """
     name = _name_for(like.device.type)
-    if like.dtype == torch.float32 and DEVICES.get(name) == like.device.type:
+    if like.dtype == torch.float32 and DEVICES.get(name) == like.device.type and all(map(_is_float32, others)):
         module = _module(name)
         if isinstance(module, ModuleType) and hasattr(module, operation):
             return getattr(module, operation)
     return getattr(_module("reference"), operation)
+
+
+def _is_float32(tensor: torch.Tensor | None) -> bool:
+    """Whether a tensor is float32, or of no floating dtype; an operand that is not there counts too."""
+    return tensor is None or tensor.dtype == torch.float32 or not tensor.is_floating_point()
 
 
 def compiled(operation: str, like: torch.Tensor) -> bool:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from invgraphics.core.field import Gaussians
 from invgraphics.core.rays import Rays
+from invgraphics.kernels.checks import check_columns, check_gaussians, check_rows, checked_rays
 from invgraphics.kernels.dispatch import choose
 
 if TYPE_CHECKING:
@@ -27,9 +28,9 @@ def gaussian_integrals(primitives: Primitives, rays: Rays, steps: int, extra: in
         extra: columns after alpha and colour: 0, 1 (distance) or 4 (and the normal).
 
     Returns:
-        (n, 4 + extra), differentiable in the primitives and in the rays.
+        (n, 4 + extra), differentiable in the primitives and in the rays' origins and directions.
     """
-    return choose("gaussian_integrals", primitives.means)(primitives, rays, steps, extra)
+    return choose("gaussian_integrals", *_tensors(primitives), *checked_rays(rays))(primitives, rays, steps, extra)
 
 
 def gaussian_composites(primitives: Primitives, rays: Rays, axes: Tensor | None, extra: int = 0) -> Float[Tensor, "n c"]:
@@ -45,9 +46,11 @@ def gaussian_composites(primitives: Primitives, rays: Rays, axes: Tensor | None,
         extra: as of `gaussian_integrals`.
 
     Returns:
-        (n, 4 + extra), differentiable in the primitives and in the rays.
+        (n, 4 + extra), differentiable in the primitives and in the rays' origins and directions, the order being fixed.
     """
-    return choose("gaussian_composites", primitives.means)(primitives, rays, axes, extra)
+    if axes is not None and axes.ndim > 1:
+        check_rows("rays", len(rays), axes=axes)
+    return choose("gaussian_composites", *_tensors(primitives), *checked_rays(rays), axes)(primitives, rays, axes, extra)
 
 
 def gaussian_density(
@@ -67,4 +70,13 @@ def gaussian_density(
     Returns:
         (m, 4), or (m, 1) without ``eye``; differentiable in the Gaussians.
     """
-    return choose("gaussian_density", position)(gaussians, position, eye, smallest)
+    check_gaussians(gaussians)
+    check_columns(3, position=position, eye=eye)
+    check_rows("positions", len(position), eye=eye)
+    return choose("gaussian_density", position, eye, *vars(gaussians).values())(gaussians, position, eye, smallest)
+
+
+def _tensors(primitives: Primitives) -> tuple[Tensor, ...]:
+    """What compiled kernels read of primitives."""
+    p = primitives
+    return p.means, p.whitening, p.strength, p.normals, p.sh, p.reach, p.radius

@@ -11,6 +11,7 @@ from invgraphics.core import fused, lattice
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.rays import Rays
 from invgraphics.kernels import types
+from invgraphics.kernels.checks import check_cube, checked_rays
 from invgraphics.kernels.dispatch import choose
 
 
@@ -57,7 +58,8 @@ def lattice_march(
 
     Arguments and result as there; appearance and networks of colour are not looked at.
     """
-    return choose("lattice_march", rays.origins)(rays, occupied, bounds, steps, field, start, min_transmittance)
+    check_cube(occupied)
+    return choose("lattice_march", *checked_rays(rays, start))(rays, occupied, bounds, steps, field, start, min_transmittance)
 
 
 def lattice_render(
@@ -74,4 +76,6 @@ def lattice_render(
 
     Arguments and results as there. Not differentiable.
     """
-    return choose("lattice_render", rays.origins)(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)
+    check_cube(occupied)
+    render = choose("lattice_render", *checked_rays(rays))
+    return render(rays, occupied, bounds, steps, field, min_transmittance, max_error, width)

@@ -43,4 +43,6 @@ def mesh_interpolate(fragments: Fragments, faces: Int[Tensor, "f 3"], features: 
         faces: of the same mesh.
         features: per vertex.
     """
-    return choose("mesh_interpolate", features)(fragments, faces, features)
+    if fragments.barycentric.shape != (*fragments.face.shape, 3):
+        raise ValueError(f"Fragments of {tuple(fragments.face.shape)} have weights of {tuple(fragments.barycentric.shape)}.")
+    return choose("mesh_interpolate", features, fragments.barycentric)(fragments, faces, features)

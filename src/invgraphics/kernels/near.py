@@ -5,6 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from invgraphics.kernels.checks import check_columns
 from invgraphics.kernels.dispatch import choose
 
 
@@ -24,4 +25,5 @@ def near_points(
     Returns:
         Indices of points, -1 where there are fewer; squared distances, infinite there. Not differentiable.
     """
-    return choose("near_points", position)(position, points, count, radius)
+    check_columns(3, position=position, points=points)
+    return choose("near_points", position, points)(position, points, count, radius)

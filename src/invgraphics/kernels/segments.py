@@ -5,6 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from invgraphics.kernels.checks import check_rows
 from invgraphics.kernels.dispatch import choose
 
 
@@ -25,6 +26,8 @@ def segment_sums(
         A row per segment, zero for one without entries; differentiable once in ``values`` and ``weights``.
 
     Raises:
+        ValueError: values, weights and segments of several lengths.
         IndexError: the first or the last entry belongs to no segment; a RuntimeError from the reference.
     """
-    return choose("segment_sums", values)(values, weights, segment, segments)
+    check_rows("rows of values", len(values), weights=weights, segment=segment)
+    return choose("segment_sums", values, weights)(values, weights, segment, segments)

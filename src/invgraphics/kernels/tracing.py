@@ -8,6 +8,7 @@ from torch import Tensor
 from invgraphics.core.bounds import Bounds
 from invgraphics.core.ngp import FusedSDF
 from invgraphics.core.rays import Rays
+from invgraphics.kernels.checks import check_columns, check_rows, check_table, checked_rays
 from invgraphics.kernels.dispatch import choose
 from invgraphics.kernels.types import TracedRays, TracingLimits
 
@@ -24,7 +25,8 @@ def sdf_trace(rays: Rays, bounds: Bounds, field: FusedSDF, limits: TracingLimits
     Returns:
         First hits and closest approaches. Not differentiable.
     """
-    return choose("sdf_trace", rays.origins)(rays, bounds, field, limits)
+    check_table(field.table, field.grid)
+    return choose("sdf_trace", *checked_rays(rays), field.table)(rays, bounds, field, limits)
 
 
 def sdf_radiance(
@@ -41,7 +43,10 @@ def sdf_radiance(
     Returns:
         Radiance in the field's colour space. Not differentiable.
     """
-    return choose("sdf_radiance", position)(position, direction, bounds, field)
+    check_columns(3, position=position, direction=direction)
+    check_rows("positions", len(position), direction=direction)
+    check_table(field.table, field.grid)
+    return choose("sdf_radiance", position, direction, field.table)(position, direction, bounds, field)
 
 
 def sdf_skip(
@@ -63,7 +68,7 @@ def sdf_skip(
     Returns:
         Distance along each ray, from near to far, before which no surface is nearer than ``margin``. Not differentiable.
     """
-    return choose("sdf_skip", rays.origins)(rays, bounds, distances, margin, least, factor)
+    return choose("sdf_skip", *checked_rays(rays), distances)(rays, bounds, distances, margin, least, factor)
 
 
 def sdf_values(position: Float[Tensor, "n 3"], bounds: Bounds, field: FusedSDF) -> Float[Tensor, " n"]:
@@ -77,4 +82,6 @@ def sdf_values(position: Float[Tensor, "n 3"], bounds: Bounds, field: FusedSDF) 
     Returns:
         Distances in local units, negative inside. Not differentiable.
     """
-    return choose("sdf_values", position)(position, bounds, field)
+    check_columns(3, position=position)
+    check_table(field.table, field.grid)
+    return choose("sdf_values", position, field.table)(position, bounds, field)

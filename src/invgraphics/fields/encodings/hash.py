@@ -77,9 +77,8 @@ class HashEncoding(Windowed):
     def forward(self, unit: Float[Tensor, "m 3"], covariance: Float[Tensor, "m 3 3"] | None = None) -> Float[Tensor, "m f"]:
         """Features at ``unit``; ``covariance`` is not used.
 
-        The gradient with respect to ``unit`` is itself differentiable in the table (a loss on normals needs it). The compiled
-        kernels take its derivative with respect to ``unit`` as zero: within a cell only the mixed second derivatives of a
-        trilinear function are not.
+        The gradient with respect to ``unit`` is itself differentiable (a loss on normals needs it in the table); within a cell
+        only the mixed second derivatives of a trilinear function are not zero.
         """
         features, _ = kernels.hash_encode(unit, self.table, self.grid)
         weights = self.level_weights()

@@ -12,7 +12,8 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from invgraphics.kernels.cuda.runtime import at_least_2, on_device_of, once_differentiable
+from invgraphics.kernels.cuda.runtime import at_least_2, on_device_of
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.reference.composite import OPAQUE
 
 _OPAQUE = tl.constexpr(OPAQUE)
@@ -30,6 +31,12 @@ def _alpha(tau):
 
 
 @triton.jit
+def _limited(tau):
+    """Optical depths, at most `OPAQUE`; NaN stays, which ``tl.minimum`` would take for the limit."""
+    return tl.where(tau > _OPAQUE, _OPAQUE, tau)
+
+
+@triton.jit
 def accumulate(
     depth, channels, first, weights, after, sums, alpha, width, WIDTH: tl.constexpr, SIZE: tl.constexpr
 ):  # fmt: skip
@@ -41,9 +48,9 @@ def accumulate(
     for start in range(begin, end, SIZE):
         sample = start + lane
         in_range = sample < end
-        tau = tl.minimum(tl.load(depth + sample, mask=in_range, other=0.0), _OPAQUE)
+        tau = _limited(tl.load(depth + sample, mask=in_range, other=0.0))
         # An exclusive scan of its own: subtracting a large tau from an inclusive one would cancel all digits.
-        nearer = tl.minimum(tl.load(depth + sample - 1, mask=in_range & (lane > 0), other=0.0), _OPAQUE)
+        nearer = _limited(tl.load(depth + sample - 1, mask=in_range & (lane > 0), other=0.0))
         before = optical + tl.cumsum(nearer, axis=0)
         weight = tl.exp(-before) * _alpha(tau)
         valid = in_range[:, None] & (column < width)[None, :]

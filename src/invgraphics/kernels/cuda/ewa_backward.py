@@ -54,8 +54,11 @@ def _rows_backward(
         det = tl.maximum(area + dilation * (xx + yy) + dilation * dilation, TINY)
         compensation = tl.sqrt(area / det)
         g = tl.load(grad_compensations + i, mask=visible, other=0.0) * compensation
-        g = tl.where(compensation > COMPENSATION_MIN, g, 0.0)
-        e, f, h = g * (yy / area - c0), -g * (xy / area + c1), g * (xx / area - c2)
+        counts = compensation > COMPENSATION_MIN
+        # Set to 0 behind the divisions: of an area that underflowed they are infinite, and 0 times that is NaN.
+        e = tl.where(counts, g * (yy / area - c0), 0.0)
+        f = tl.where(counts, -g * (xy / area + c1), 0.0)
+        h = tl.where(counts, g * (xx / area - c2), 0.0)
         gx0, gx1, gx2 = gx0 + e * x0 + f * y0, gx1 + e * x1 + f * y1, gx2 + e * x2 + f * y2
         gy0, gy1, gy2 = gy0 + f * x0 + h * y0, gy1 + f * x1 + h * y1, gy2 + f * x2 + h * y2
     return gx0, gx1, gx2, gy0, gy1, gy2

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
-from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of, once_differentiable
+from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of
+from invgraphics.kernels.differentiation import once_differentiable, positions_only
 from invgraphics.kernels.reference.hash import PRIMES
 
 BLOCK = 256
@@ -124,7 +125,7 @@ def _levels(grid: HashGrid, device: torch.device) -> Tensor:
 
 
 class _Encode(torch.autograd.Function):
-    """Differentiable in positions and table."""
+    """Differentiable in positions and table, twice."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
@@ -135,20 +136,22 @@ class _Encode(torch.autograd.Function):
             with on_device_of(table):
                 encode[(blocks(len(unit), BLOCK), grid.levels)](unit, table, levels, out, *sizes)
         ctx.save_for_backward(unit, table)
-        ctx.grid = grid
+        ctx.grid, ctx.positions_only = grid, positions_only()
         return out
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         unit, table = ctx.saved_tensors
         gradient = grad_outputs[0].contiguous()
+        wants_table = ctx.needs_input_grad[1] and not ctx.positions_only
+        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if wants_table else None
+        unit = unit.detach() if ctx.positions_only else unit
         grad_unit = _PositionGradient.apply(unit, table, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
-        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if ctx.needs_input_grad[1] else None
         return grad_unit, grad_table, None
 
 
 class _PositionGradient(torch.autograd.Function):
-    """Gradient of the positions; its own derivatives in table and cotangent are left to the reference."""
+    """Gradient of the positions; its own derivatives are left to the reference."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, table: Tensor, gradient: Tensor, grid: HashGrid) -> Tensor:
@@ -165,17 +168,18 @@ class _PositionGradient(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        unit, table, gradient = (tensor.detach() for tensor in ctx.saved_tensors)
+        leaves = [x.detach().requires_grad_(needed) for x, needed in zip(ctx.saved_tensors, ctx.needs_input_grad, strict=False)]
         with torch.enable_grad():
-            table, gradient = table.requires_grad_(), gradient.requires_grad_()
-            _, jacobian = reference.hash_encode(unit, table, ctx.grid, jacobian=True)
+            _, jacobian = reference.hash_encode(leaves[0], leaves[1], ctx.grid, jacobian=True)
             assert jacobian is not None
-            grad_unit = torch.einsum("mfa,mf->ma", jacobian, gradient)
-            return None, *torch.autograd.grad(grad_unit, [table, gradient], grad_outputs[0]), None
+            grad_unit = torch.einsum("mfa,mf->ma", jacobian, leaves[2])
+        wanted = [leaf for leaf in leaves if leaf.requires_grad]
+        found = iter(torch.autograd.grad(grad_unit, wanted, grad_outputs[0], allow_unused=True))
+        return *(next(found) if leaf.requires_grad else None for leaf in leaves), None
 
 
 class _TableGradient(torch.autograd.Function):
-    """Gradient of the table; not differentiable again."""
+    """Gradient of the table, linear in the cotangent; itself differentiable."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, gradient: Tensor, shape: torch.Size, grid: HashGrid) -> Tensor:
@@ -185,7 +189,17 @@ class _TableGradient(torch.autograd.Function):
             with on_device_of(gradient):
                 along = blocks(len(unit), BLOCK)
                 encode_backward[(along, grid.levels)](unit, gradient, _levels(grid, unit.device), grad_table, *sizes)
+        ctx.save_for_backward(unit, gradient)
+        ctx.grid = grid
         return grad_table
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        """A direction in the table times its gradient is the cotangent times the features of that direction."""
+        along, (unit, gradient) = grad_outputs[0].contiguous(), ctx.saved_tensors
+        grad_unit = _PositionGradient.apply(unit, along, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
+        grad_cotangent = _Encode.apply(unit, along, ctx.grid) if ctx.needs_input_grad[1] else None
+        return grad_unit, grad_cotangent, None, None
 
 
 def hash_encode(

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from invgraphics.core.lattice import Combination, Lattice
 from invgraphics.kernels.cuda.runtime import at_least_2, blocks, on_device_of
+from invgraphics.kernels.differentiation import positions_only
 from invgraphics.kernels.reference.lattice import combine_features, interpolate
 
 BLOCK = 64
@@ -125,7 +126,7 @@ class _Interpolate(torch.autograd.Function):
         links = shape if lattice.links is None else lattice.links.contiguous()
         ctx.sizes = len(unit), len(rows), channels
         ctx.flags = {"AXES": axes, "LINKED": lattice.links is not None, "WIDTH": at_least_2(channels), "SIZE": BLOCK}
-        ctx.lattice = lattice
+        ctx.lattice, ctx.positions_only = lattice, positions_only()
         out = unit.new_empty(len(unit), channels)
         if len(unit):
             with on_device_of(unit):
@@ -138,9 +139,12 @@ class _Interpolate(torch.autograd.Function):
         unit, features, links, shape = ctx.saved_tensors
         if torch.is_grad_enabled():  # a second derivative may follow
             lattice = replace(ctx.lattice, features=features)
-            wanted = [x for x, needed in zip((unit, features), ctx.needs_input_grad, strict=False) if needed]
+            needs = (ctx.needs_input_grad[0], ctx.needs_input_grad[1] and not ctx.positions_only)
+            wanted = [x for x, needed in zip((unit, features), needs, strict=True) if needed]
+            if not wanted:
+                return None, None, None
             gradients = iter(torch.autograd.grad(interpolate(unit, lattice), wanted, grad_outputs[0], create_graph=True))
-            return *(next(gradients) if needed else None for needed in ctx.needs_input_grad[:2]), None
+            return *(next(gradients) if needed else None for needed in needs), None
         gradient, grad_unit, grad_features = grad_outputs[0].contiguous(), torch.zeros_like(unit), torch.zeros_like(features)
         flags = {"POSITIONS": ctx.needs_input_grad[0], **ctx.flags}
         if len(unit):

@@ -15,7 +15,8 @@ from invgraphics.core.field import Gaussians
 from invgraphics.kernels import reference, types
 from invgraphics.kernels.cuda.ewa import project
 from invgraphics.kernels.cuda.ewa_backward import project_backward
-from invgraphics.kernels.cuda.runtime import blocks, on_device_of, once_differentiable
+from invgraphics.kernels.cuda.runtime import blocks, on_device_of
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.reference.splat_project import depth_plane_gradients
 
 BLOCK = 128

@@ -18,7 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference, types
-from invgraphics.kernels.cuda.runtime import on_device_of, once_differentiable
+from invgraphics.kernels.cuda.runtime import on_device_of
+from invgraphics.kernels.differentiation import once_differentiable
 
 _ALPHA_MIN, _ALPHA_MAX = tl.constexpr(types.ALPHA_MIN), tl.constexpr(types.ALPHA_MAX)
 _TRANSMITTANCE_MIN = tl.constexpr(types.TRANSMITTANCE_MIN)

@@ -7,8 +7,6 @@ from typing import Any
 
 import torch
 
-once_differentiable: Any = torch.autograd.function.once_differentiable
-
 
 def on_device_of(tensor: torch.Tensor) -> AbstractContextManager[Any]:
     """Context in which a tensor's GPU is current, as Triton launches need; a no-op for its interpreter on a CPU."""

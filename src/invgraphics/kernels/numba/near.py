@@ -17,8 +17,15 @@ MOST_CELLS = 1 << 22
 
 @exact
 def _cell(x, lo, inverse, cells):
-    """Index of a coordinate's cell, clamped to the grid."""
-    return min(max(np.int64((x - lo) * inverse), np.int64(0)), cells - 1)
+    """Index of a finite coordinate's cell, clamped to the grid, before the conversion: what int64 cannot hold is undefined."""
+    return np.int64(min(max((x - lo) * inverse, 0.0), cells - 1.0))
+
+
+@exact
+def _cell_or_beyond(x, lo, inverse, cells):
+    """Index of a coordinate's cell, -1 or ``cells`` if it is next to the grid; -2, whose neighbours are none, otherwise."""
+    at = np.floor((x - lo) * inverse)
+    return np.int64(at) if at >= -1.0 and at <= cells else np.int64(-2)
 
 
 @exact_parallel
@@ -70,10 +77,9 @@ def find_near(position, points, lo, inverse, shape, first, order, limit, jobs, i
     for job in prange(jobs):
         for q in range(job_start(m, jobs, job), job_start(m, jobs, job + 1)):
             px, py, pz = position[q, 0], position[q, 1], position[q, 2]
-            # Cells may lie beyond the grid: floor of the coordinate, not clamped.
-            cx = np.int64(math.floor((px - lo[0]) * inverse))
-            cy = np.int64(math.floor((py - lo[1]) * inverse))
-            cz = np.int64(math.floor((pz - lo[2]) * inverse))
+            cx = _cell_or_beyond(px, lo[0], inverse, shape[0])
+            cy = _cell_or_beyond(py, lo[1], inverse, shape[1])
+            cz = _cell_or_beyond(pz, lo[2], inverse, shape[2])
             z0, z1 = max(cz - 1, np.int64(0)), min(cz + 1, shape[2] - 1)
             kept = 0
             if z0 <= z1:
@@ -100,19 +106,25 @@ def near_points(
         return index, squared
     known = points.detach()
     lo = known.amin(dim=0)
-    size = (known.amax(dim=0) - lo).double()
+    size = known.amax(dim=0).double() - lo.double()
+    if not bool(size.isfinite().all()):
+        # Points that are not finite are near nothing, and would leave the others without a grid.
+        finite = known.isfinite().all(dim=1).nonzero()[:, 0]
+        index, squared = near_points(position, known[finite], count, radius)
+        return torch.where(index >= 0, finite[index.clamp_min(0)], -1) if len(finite) else index, squared
     # A little wider than the radius, so that rounding, up to about 1e-7 of the cells along an edge, puts no neighbour into the
     # cell after the next.
     edge = max(radius * (1 + 1e-4), 1e-12)
-    while math.prod((size / edge + 1).long().tolist()) > MOST_CELLS:
+    while math.prod((size / edge + 1).floor().tolist()) > MOST_CELLS:
         edge *= 1.25
     shape = (size / edge).long().numpy() + 1
-    flat, inverse, jobs = array(known), np.float32(1 / edge), threads()
+    # float64, in which differences of float32 cannot overflow.
+    flat, corner, inverse, jobs = array(known), lo.double().numpy(), 1 / edge, threads()
     cells = int(np.prod(shape))
     cell, order = scratch("near.cell", n, np.int64), scratch("near.order", n, np.int64)
     first = scratch("near.first", cells + 1, np.int64)
-    fill_cells(flat, lo.numpy(), inverse, shape, jobs, cell, first, order)
+    fill_cells(flat, corner, inverse, shape, jobs, cell, first, order)
     limit = np.float32(radius * radius)
     found = index.numpy(), squared.numpy()
-    find_near(array(position), flat, lo.numpy(), inverse, shape, first, order, limit, jobs, *found)
+    find_near(array(position), flat, corner, inverse, shape, first, order, limit, jobs, *found)
     return index, squared

@@ -147,9 +147,8 @@ exact_parallel = _cached(parallel=True, fastmath=False)
 exact = _njit(fastmath=False, forceinline=True, no_cpython_wrapper=True)
 """`parallel` and `inlined` in plain IEEE arithmetic; an inlined function without flags inherits its caller's."""
 
-# Both packages type these in ways that no checker can follow.
+# Typed in a way that no checker can follow.
 prange: Any = nb.prange
-once_differentiable: Any = torch.autograd.function.once_differentiable
 
 # Starting Numba's threads sets OpenMP's thread count for the whole process, torch's too: put it back.
 _torch_threads = torch.get_num_threads()

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from invgraphics.kernels.numba.runtime import array, index, inlined, job_start, once_differentiable, parallel, prange, threads
+from invgraphics.kernels.differentiation import once_differentiable
+from invgraphics.kernels.numba.runtime import array, index, inlined, job_start, parallel, prange, threads
 
 
 @inlined

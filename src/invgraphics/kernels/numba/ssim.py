@@ -13,13 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.numba.runtime import (
     GROUP,
     array,
     index,
     inlined,
     job_start,
-    once_differentiable,
     parallel,
     prange,
     scratch,

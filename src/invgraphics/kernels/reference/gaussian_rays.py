@@ -116,7 +116,7 @@ def precompute(
 
 def intersect(primitives: Primitives, rays: Rays) -> Intersections:
     """Intersect rays with Gaussians within their reach, differentiably in Gaussians and rays."""
-    ray, gaussian = choose("gaussian_pairs", primitives.means)(primitives, rays)
+    ray, gaussian = choose("gaussian_pairs", primitives.means, rays.origins)(primitives, rays)
     table = torch.cat([primitives.means, primitives.whitening.flatten(1), primitives.strength[:, None]], dim=1)
     # index_select has a faster gradient than indexing.
     means, whitening, factor = table.index_select(0, gaussian).split([3, 9, 1], dim=1)

@@ -70,6 +70,9 @@ def overlapping_pairs(
 @torch.no_grad()
 def cell_lists(gaussians: Gaussians, position: Float[Tensor, "m 3"], smallest: float) -> CellLists | None:
     """Cell lists of the Gaussians that can reach the bounding box of positions; ``None`` without any."""
+    # A position that is not finite is reached by nothing, and would leave no box around the others.
+    finite = position.isfinite().all(dim=1)
+    position = position if bool(finite.all()) else position[finite]
     if not len(position):
         return None
     deviations = reach(gaussians, "physical", smallest)

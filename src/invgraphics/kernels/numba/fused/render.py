@@ -28,7 +28,7 @@ from invgraphics.kernels.numba.fused.heads import (
     points_words,
 )
 from invgraphics.kernels.numba.ngp.dense import POINTS
-from invgraphics.kernels.numba.ngp.network import ACTIVATIONS, radial_scale
+from invgraphics.kernels.numba.ngp.network import ACTIVATIONS, radial_scale_at
 from invgraphics.kernels.numba.ngp.queue import EDGE, empty_queue, harmonics_offset, next_samples, queue_memory
 from invgraphics.kernels.numba.ngp.render import composite_sample
 from invgraphics.kernels.numba.rays.march import traversal_setup
@@ -71,13 +71,21 @@ def crop_points(points, crop):
 
 @inlined
 def density_scale(settings, points, crop, p):
-    """Factor of the density of batch lane ``p``; ``settings`` end with `DensityHead.scale` and ``contracted``."""
+    """Factor of the density of batch lane ``p``; ``settings`` end with `DensityHead.scale` and ``contracted``.
+
+    ``points`` are those after `crop_points`; contraction is that of the bounds.
+    """
     scale, contracted = settings[-2], settings[-1]
     if crop[2, 0] > _ZERO:
         for axis in range(3):
             if points[axis, p] < _ZERO or points[axis, p] > _ONE:
                 return _ZERO
-    return scale * (contracted * radial_scale(points, p)) if contracted > _ZERO else scale
+    if contracted > _ZERO:
+        x, y, z = points[0, p], points[1, p], points[2, p]
+        if crop[2, 0] > _ZERO:
+            x, y, z = crop[0, 0] + x / crop[1, 0], crop[0, 1] + y / crop[1, 1], crop[0, 2] + z / crop[1, 2]
+        scale = scale * (contracted * radial_scale_at(x, y, z))
+    return scale
 
 
 @inlined

@@ -10,10 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.field import Gaussians
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.extinction import SMALLEST_DEPTH, reach
 from invgraphics.kernels.numba.gaussians.backward import cut_off, spread_colour_gradients
 from invgraphics.kernels.numba.gaussians.integrals import STRIDE, seen_colour
-from invgraphics.kernels.numba.runtime import array, exp2, inlined, job_start, once_differentiable, parallel, prange, threads
+from invgraphics.kernels.numba.runtime import array, exp2, inlined, job_start, parallel, prange, threads
 from invgraphics.kernels.reference import gaussian_sums as reference
 
 SAME_EYE = np.float32(1e-10)

@@ -20,12 +20,14 @@ _EIGHT, _ZERO, _HALF, _ONE = np.float32(MAX_DEVIATIONS), np.float32(0.0), np.flo
 _ALPHA_MAX = np.float32(ALPHA_MAX)
 _HALF_LOG2E = np.float32(0.5 / np.log(2.0))
 _ROOT = np.float32(1 / np.sqrt(2 * np.pi))
+_SHORTEST = np.float32(1e-12)
+"""Length up to which vectors are divided by this instead of their length, as in torch's ``normalize``."""
 
 
 @inlined
 def colour_of(sh, g, cx, cy, cz, basis, rgb):
     """Colour of a Gaussian at an offset, before it is cut off at 0; ``basis`` gets the functions. Returns 1 / the distance."""
-    inverse = _ONE / np.sqrt(cx * cx + cy * cy + cz * cz)
+    inverse = _ONE / max(np.sqrt(cx * cx + cy * cy + cz * cz), _SHORTEST)
     harmonics((cx * inverse, cy * inverse, cz * inverse), basis, np.uintp(0))
     for c in range(3):
         value = _HALF

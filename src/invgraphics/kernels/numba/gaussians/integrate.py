@@ -10,13 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.rays import Rays
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.extinction import is_density
 from invgraphics.kernels.numba.gaussians.backward import integrate_backward
 from invgraphics.kernels.numba.gaussians.integrals import integrate
 from invgraphics.kernels.numba.gaussians.nodes import COUNT, PASSES
 from invgraphics.kernels.numba.gaussians.pairs import gaussian_pairs
 from invgraphics.kernels.numba.gaussians.shares import ROWS
-from invgraphics.kernels.numba.runtime import GROUP, array, once_differentiable, scratch, split_by_work, threads
+from invgraphics.kernels.numba.runtime import GROUP, array, scratch, split_by_work, threads
 from invgraphics.kernels.reference import gaussian_quadrature as reference
 from invgraphics.kernels.reference.gaussian_rays import Primitives
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.core.rays import Rays
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.extinction import is_density
 from invgraphics.kernels.numba.gaussians.backward import cut_off, place_gradient, spread_colour_gradients
 from invgraphics.kernels.numba.gaussians.integrals import STRIDE, optical_depths, seen_colour, shares_origin
@@ -19,7 +20,6 @@ from invgraphics.kernels.numba.runtime import (
     array,
     exp2,
     inlined,
-    once_differentiable,
     parallel,
     prange,
     split_by_work,

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from invgraphics.core.ngp import HashGrid
 from invgraphics.kernels import reference
+from invgraphics.kernels.differentiation import once_differentiable, positions_only
 from invgraphics.kernels.numba.hash.blocks import TWO, block_at, gather_block, scatter_block
 from invgraphics.kernels.numba.hash.cells import BLOCK, CHUNK, ZERO, locate_block, prefetch_entries
-from invgraphics.kernels.numba.hash.jacobian import encode_jvp, encode_jvp_backward, position_gradient
-from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, threads
+from invgraphics.kernels.numba.hash.jacobian import encode_jvp, encode_jvp_backward, hessian_product, position_gradient
+from invgraphics.kernels.numba.runtime import array, index, job_start, parallel, prange, threads
 
 
 @parallel
@@ -70,7 +71,7 @@ def _by_axis(unit: Tensor) -> np.ndarray:
 
 
 class _Encode(torch.autograd.Function):
-    """Differentiable in positions and table."""
+    """Differentiable in positions and table, twice."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
@@ -78,20 +79,22 @@ class _Encode(torch.autograd.Function):
         out = unit.new_empty(len(unit), grid.levels * width)
         encode(_by_axis(unit), array(table).reshape(-1), index(width), *levels_of(grid), threads(), out.numpy())
         ctx.save_for_backward(unit, table)
-        ctx.grid = grid
+        ctx.grid, ctx.positions_only = grid, positions_only()
         return out
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         (gradient,) = grad_outputs
         unit, table = ctx.saved_tensors
+        wants_table = ctx.needs_input_grad[1] and not ctx.positions_only
+        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if wants_table else None
+        unit = unit.detach() if ctx.positions_only else unit
         grad_unit = _PositionGradient.apply(unit, table, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
-        grad_table = _TableGradient.apply(unit, gradient, table.shape, ctx.grid) if ctx.needs_input_grad[1] else None
         return grad_unit, grad_table, None
 
 
 class _PositionGradient(torch.autograd.Function):
-    """Gradient of the positions, itself differentiable in table and cotangent, but constant in the positions."""
+    """Gradient of the positions, itself differentiable."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, table: Tensor, gradient: Tensor, grid: HashGrid) -> Tensor:
@@ -107,25 +110,39 @@ class _PositionGradient(torch.autograd.Function):
         unit, table, gradient = ctx.saved_tensors
         along = torch.where((unit >= 0) & (unit <= 1), grad_outputs[0], 0.0)
         points, direction, width, levels = _by_axis(unit), _by_axis(along), index(table.shape[1]), levels_of(ctx.grid)
-        grad_table = grad_cotangent = None
+        grad_unit = grad_table = grad_cotangent = None
+        if ctx.needs_input_grad[0]:
+            by_axis, flat = torch.empty(3, len(unit)), array(table).reshape(-1)
+            hessian_product(points, flat, array(gradient), direction, width, *levels, threads(), by_axis.numpy())
+            grad_unit = torch.where((unit >= 0) & (unit <= 1), by_axis.T, 0.0)
         if ctx.needs_input_grad[1]:
             grad_table = torch.empty(table.shape)
             encode_jvp_backward(points, array(gradient), direction, width, *levels, threads(), grad_table.numpy().reshape(-1))
         if ctx.needs_input_grad[2]:
             grad_cotangent = torch.empty(gradient.shape)
             encode_jvp(points, array(table).reshape(-1), direction, width, *levels, threads(), grad_cotangent.numpy())
-        return None, grad_table, grad_cotangent, None
+        return grad_unit, grad_table, grad_cotangent, None
 
 
 class _TableGradient(torch.autograd.Function):
-    """Gradient of the table; not differentiable again."""
+    """Gradient of the table, linear in the cotangent; itself differentiable."""
 
     @staticmethod
     def forward(ctx: Any, unit: Tensor, gradient: Tensor, shape: torch.Size, grid: HashGrid) -> Tensor:
         grad_table = torch.empty(shape)
         flat = grad_table.numpy().reshape(-1)
         encode_backward(_by_axis(unit), array(gradient), index(shape[1]), *levels_of(grid), threads(), flat)
+        ctx.save_for_backward(unit, gradient)
+        ctx.grid = grid
         return grad_table
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        """A direction in the table times its gradient is the cotangent times the features of that direction."""
+        (along,), (unit, gradient) = grad_outputs, ctx.saved_tensors
+        grad_unit = _PositionGradient.apply(unit, along, gradient, ctx.grid) if ctx.needs_input_grad[0] else None
+        grad_cotangent = _Encode.apply(unit, along, ctx.grid) if ctx.needs_input_grad[1] else None
+        return grad_unit, grad_cotangent, None, None
 
 
 def hash_encode(

@@ -21,6 +21,17 @@ def trilinear_gradient(v, f):
 
 
 @inlined
+def mixed_derivatives(v, f):
+    """Second derivatives (xy, xz, yz) of the trilinear interpolant of the 8 values ``v`` in the fractions ``f``."""
+    x, y, z = f
+    p, q, r = ONE - x, ONE - y, ONE - z
+    xy = r * (v[0] - v[1] - v[2] + v[3]) + z * (v[4] - v[5] - v[6] + v[7])
+    xz = q * (v[0] - v[1] - v[4] + v[5]) + y * (v[2] - v[3] - v[6] + v[7])
+    yz = p * (v[0] - v[2] - v[4] + v[6]) + x * (v[1] - v[3] - v[5] + v[7])
+    return xy, xz, yz
+
+
+@inlined
 def weights_jvp(f, v, scale):
     """Jacobian-vector product of `trilinear_weights`: derivatives of the weights in the direction ``v``."""
     x, y, z = f
@@ -77,6 +88,35 @@ def _add_gradient(products, fractions, block, scale, grad_positions):
         grad_positions[0, first + n] += scale * along_x
         grad_positions[1, first + n] += scale * along_y
         grad_positions[2, first + n] += scale * along_z
+
+
+@parallel
+def hessian_product(positions, table, gradient, along, width, cells, offsets, masks, jobs, out):
+    """Derivative of `position_gradient` along a direction ``along`` at each point, (3, m) like ``out``; clamping is ignored.
+
+    Within a cell the features are trilinear: of the second derivatives only the mixed ones are not zero.
+    """
+    x, y, z = positions[0], positions[1], positions[2]
+    for job in prange(jobs):
+        entries, fractions = np.empty(8 * BLOCK, np.uint32), np.empty((3, BLOCK), np.float32)
+        products = np.empty(8 * BLOCK, np.float32)
+        begin, end = job_start(len(x), jobs, job), job_start(len(x), jobs, job + 1)
+        out[:, begin:end] = ZERO
+        for number in range(len(cells)):
+            level, column = (cells[number], offsets[number], masks[number]), index(number) * width
+            for start in range(begin, end, BLOCK):
+                first, count = block_at(start, end)
+                locate_fractions(x, y, z, (first, count), level, entries, fractions)
+                dot_block(table, entries, gradient, (first, count), column, width, products)
+                squared = np.float32(cells[number]) * np.float32(cells[number])
+                for point in range(count):
+                    n = index(point)
+                    f = fractions[0, n], fractions[1, n], fractions[2, n]
+                    xy, xz, yz = mixed_derivatives(load_corners(products, n), f)
+                    a, b, c = along[0, first + n], along[1, first + n], along[2, first + n]
+                    out[0, first + n] += squared * (xy * b + xz * c)
+                    out[1, first + n] += squared * (xy * a + yz * c)
+                    out[2, first + n] += squared * (xz * a + yz * b)
 
 
 @inlined

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from invgraphics.core.lattice import Combination, Lattice
 from invgraphics.kernels import reference
+from invgraphics.kernels.differentiation import once_differentiable, positions_only
 from invgraphics.kernels.numba.lattice.backward import (
     TARGET,
     add_copies,
@@ -36,7 +37,7 @@ from invgraphics.kernels.numba.lattice.pairs import is_pair, multiply_pair
 from invgraphics.kernels.numba.lattice.positions import position_gradient
 from invgraphics.kernels.numba.lattice.rows import interpolate_block
 from invgraphics.kernels.numba.lattice.touched import sparse_rows, touched_rows
-from invgraphics.kernels.numba.runtime import array, index, job_start, once_differentiable, parallel, prange, scratch, threads
+from invgraphics.kernels.numba.runtime import array, index, job_start, parallel, prange, scratch, threads
 from invgraphics.kernels.numba.simd.partial import unowned
 
 MOST_ROWS = 2**32 - 1
@@ -101,13 +102,17 @@ class _Encode(torch.autograd.Function):
         jobs = threads()
         encode(array(unit.T), table, memory_of(CORNERS_OF_TWO, jobs), jobs, out.numpy())
         ctx.save_for_backward(unit, *features)
-        ctx.shape = shape
+        ctx.shape, ctx.positions_only = shape, positions_only()
         return out
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> Any:
         unit, *features = ctx.saved_tensors
         wanted = (ctx.needs_input_grad[0], *ctx.needs_input_grad[2:])
+        if ctx.positions_only:
+            unit, wanted = unit.detach(), (wanted[0], *(False for _ in features))
+        if not any(wanted):
+            return (None,) * len(ctx.needs_input_grad)
         # A gradient that is differentiated again is dense.
         shape = replace(ctx.shape, sparse_gradients=ctx.shape.sparse_gradients and not torch.is_grad_enabled())
         found = iter(_Gradient.apply(unit, grad_outputs[0], shape, wanted, *features))

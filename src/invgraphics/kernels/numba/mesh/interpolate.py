@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from invgraphics.kernels.numba.runtime import array, job_start, once_differentiable, parallel, prange, serial, threads
+from invgraphics.kernels.differentiation import once_differentiable
+from invgraphics.kernels.numba.mesh.rasterise import check_faces
+from invgraphics.kernels.numba.runtime import array, job_start, parallel, prange, serial, threads
 from invgraphics.kernels.types import Fragments
 
 
@@ -77,5 +79,8 @@ class _Interpolate(torch.autograd.Function):
 
 def mesh_interpolate(fragments: Fragments, faces: Int[Tensor, "f 3"], features: Float[Tensor, "v c"]) -> Float[Tensor, "h w c"]:
     """See `invgraphics.kernels.mesh_interpolate`."""
+    check_faces(faces, len(features))
+    if fragments.face.numel() and int(fragments.face.max()) >= len(faces):
+        raise IndexError(f"Fragments are of faces up to {int(fragments.face.max())}, but there are {len(faces)} faces.")
     flat = _Interpolate.apply(features, fragments.barycentric.reshape(-1, 3), fragments.face.reshape(-1), faces.long())
     return flat.view(*fragments.face.shape, features.shape[1])

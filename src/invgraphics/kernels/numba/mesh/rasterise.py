@@ -109,6 +109,18 @@ def rasterise(vertices, faces, boxes, lens, near, far, bands, face, barycentric,
                         barycentric[row, column, 2] = w2 / total
 
 
+def check_faces(faces: Int[Tensor, "f 3"], vertices: int) -> None:
+    """Check that all corners are vertices: kernels would read foreign memory.
+
+    Raises:
+        IndexError: a corner is not one of that number of vertices.
+    """
+    if faces.numel():
+        first, last = (int(corner) for corner in faces.aminmax())
+        if first < 0 or last >= vertices:
+            raise IndexError(f"Corners of faces are vertices {first} to {last}, but there are {vertices} vertices.")
+
+
 def mesh_rasterise(
     vertices: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
@@ -116,6 +128,7 @@ def mesh_rasterise(
     interval: tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]] | None = None,
 ) -> Fragments:
     """See `invgraphics.kernels.mesh_rasterise`."""
+    check_faces(faces, len(vertices))
     width, height, jobs = camera.width, camera.height, threads()
     lens = np.concatenate([array(camera.focal.double()), array(camera.principal_point.double())])
     near, far = np.zeros((height, width)), np.full((height, width), np.inf)

@@ -47,8 +47,14 @@ def activate_density(raw, activation):
 
 @inlined
 def radial_scale(points, p):
-    """`Bounds.radial_scale` at position ``p`` in the unit cube of a contracted space: (2 - |y|)², y after contraction."""
-    x, y, z = _FOUR * points[0, p] - _TWO, _FOUR * points[1, p] - _TWO, _FOUR * points[2, p] - _TWO
+    """`radial_scale_at` column ``p`` of positions."""
+    return radial_scale_at(points[0, p], points[1, p], points[2, p])
+
+
+@inlined
+def radial_scale_at(ux, uy, uz):
+    """`Bounds.radial_scale` at a position in the unit cube of a contracted space: (2 - |y|)², y after contraction."""
+    x, y, z = _FOUR * ux - _TWO, _FOUR * uy - _TWO, _FOUR * uz - _TWO
     remaining = min(_TWO - np.sqrt(x * x + y * y + z * z), _ONE)
     return remaining * remaining
 

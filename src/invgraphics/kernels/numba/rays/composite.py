@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from invgraphics.kernels.differentiation import once_differentiable
 from invgraphics.kernels.numba.runtime import (
     array,
     index,
     inlined,
-    once_differentiable,
     parallel,
     power_minus_one,
     prange,

@@ -203,7 +203,7 @@ def march_rays(rays, state, limit, setup, t0, t1):
                 empty = valid & (distance >= _ZERO)
                 exit_distance = _skip_distance(unit, cells, distance, grid, inverse)
                 empty_until = where(empty, min(midpoint + exit_distance - MARGIN * (end - t), far), empty_until)
-                if cone == _ZERO:
+                if cone == _ZERO and not uniform:
                     # To the first step whose midpoint is past the wall, or the one before; ``tested`` decides.
                     error = ROUNDING * (abs(first) + abs(empty_until))
                     target = np.floor((empty_until - first - error) * per_step + NEARLY_HALF)

@@ -19,6 +19,7 @@ from numba.core.typeconv import Conversion
 from numba.core.typing import templates
 
 from invgraphics.kernels.numba.runtime import GROUP, exp2_fraction, inlined
+from invgraphics.kernels.numba.simd.arrays import check_array
 
 _WORD = ir.IntType(32)
 _WORDS = ir.VectorType(_WORD, GROUP)
@@ -113,6 +114,7 @@ def _place(context: Any, builder: Any, kind: Any, flat: Any, at: Any) -> Any:
 @_intrinsic
 def load(typing: Any, flat: Any, at: Any) -> Any:
     """Load `LANES` values of a flat array from ``at`` (uint64) on."""
+    check_array(flat)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_place(context, builder, signature.args[0], *arguments), align=4)
@@ -123,6 +125,7 @@ def load(typing: Any, flat: Any, at: Any) -> Any:
 @_intrinsic
 def store(typing: Any, flat: Any, at: Any, value: Any) -> Any:
     """Store `LANES` values to a flat array from ``at`` (uint64) on."""
+    check_array(flat)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.store(arguments[2], _place(context, builder, signature.args[0], *arguments[:2]), align=4)
@@ -144,6 +147,7 @@ def _to_int(builder: Any, values: Any) -> Any:
 @_intrinsic
 def scatter(typing: Any, flat: Any, at: Any, value: Any) -> Any:
     """Scatter: store each lane's value at its index in ``at`` (whole numbers), in lane order."""
+    check_array(flat)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -157,6 +161,7 @@ def scatter(typing: Any, flat: Any, at: Any, value: Any) -> Any:
 @_intrinsic
 def gather_int8(typing: Any, cube: Any, x: Any, y: Any, z: Any) -> Any:
     """Gather from a contiguous int8 cube at each lane's indices (whole numbers), converted to float32."""
+    check_array(cube, types.int8)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         found = context.make_array(signature.args[0])(context, builder, arguments[0])

@@ -9,12 +9,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numba as nb
-import numpy as np
 from llvmlite import ir
 from numba import extending
 from numba.core import cgutils, types
 
 from invgraphics.kernels.numba.runtime import GROUP, inlined
+from invgraphics.kernels.numba.simd.arrays import check_array
 from invgraphics.kernels.numba.simd.lanes import lanes
 
 _WORD = ir.IntType(32)
@@ -73,6 +73,7 @@ def _part(context: Any, builder: Any, kind: Any, arguments: Any, first: int, wid
 @_intrinsic
 def load_first(typing: Any, flat: Any, at: Any, count: Any) -> Any:
     """Load ``count`` (at least 1) values of a flat array from ``at`` (uint64) on into the first lanes, 0 into the others."""
+    check_array(flat)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         end, incoming = builder.append_basic_block(), []
@@ -112,6 +113,7 @@ def load_first(typing: Any, flat: Any, at: Any, count: Any) -> Any:
 @_intrinsic
 def store_first(typing: Any, flat: Any, at: Any, count: Any, value: Any) -> Any:
     """Store the first ``count`` (at least 1) lanes to a flat array from ``at`` (uint64) on."""
+    check_array(flat)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         end = builder.append_basic_block()
@@ -190,7 +192,19 @@ def doubles_at(address, size):
     return nb.carray(_double_pointer(address), size)
 
 
+@_intrinsic
+def _float32_address(typing: Any, values: Any) -> Any:
+    """Address (int64) of a float32 array's first value."""
+    check_array(values)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return builder.ptrtoint(data, ir.IntType(64))
+
+    return types.int64(values), generate
+
+
 @inlined
 def unowned(values):
     """A contiguous float32 array as a flat one that is not counted; the caller keeps the memory."""
-    return floats_at(np.int64(values.ctypes.data), values.size)
+    return floats_at(_float32_address(values), values.size)

@@ -55,8 +55,10 @@ def _inverse_backward(conic, g):
 def _compensation_backward(x, y, dilation, conic, grad_compensation):
     """Gradients of the screen axes: d ln compensation = (d area / area - d det / det) / 2, both quadratic in the axes."""
     compensation, xx, xy, yy, area = compensation_of(x, y, dilation)
-    g = grad_compensation * compensation if compensation > _COMPENSATION_MIN else _ZERO
+    g, counts = grad_compensation * compensation, compensation > _COMPENSATION_MIN
     a, b, c = g * (yy / area - conic[0]), -g * (xy / area + conic[1]), g * (xx / area - conic[2])
+    # Set to 0 behind the divisions: of an area that underflowed they are infinite, and 0 times that is NaN.
+    a, b, c = a if counts else _ZERO, b if counts else _ZERO, c if counts else _ZERO
     return (
         (a * x[0] + b * y[0], a * x[1] + b * y[1], a * x[2] + b * y[2]),
         (b * x[0] + c * y[0], b * x[1] + c * y[1], b * x[2] + c * y[2]),

@@ -13,7 +13,8 @@ from torch import Tensor
 from invgraphics.core.camera import Camera
 from invgraphics.core.field import Gaussians
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.runtime import array, once_differentiable, threads
+from invgraphics.kernels.differentiation import once_differentiable
+from invgraphics.kernels.numba.runtime import array, threads
 from invgraphics.kernels.numba.splat.ewa import CENTRE, FOCAL, POSITION, SIZE, VIEW, project
 from invgraphics.kernels.numba.splat.ewa_backward import project_backward
 from invgraphics.kernels.reference.splat_project import depth_plane_gradients

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from invgraphics.kernels import reference
-from invgraphics.kernels.numba.runtime import GROUP, array, once_differentiable, scratch, split_by_work, threads
+from invgraphics.kernels.differentiation import once_differentiable
+from invgraphics.kernels.numba.runtime import GROUP, array, scratch, split_by_work, threads
 from invgraphics.kernels.numba.splat.binning import FEATURES, Packed, pack_and_intersect
 from invgraphics.kernels.numba.splat.median import median
 from invgraphics.kernels.numba.splat.raster import BLOCK, BLOCKS, EDGE, rasterise
