@@ -40,7 +40,7 @@ test: env  ## compile the kernels, once for all processes (2 minutes), and run t
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-triton: env  ## install triton (0.6 GB) and test the GPU's kernels without one: interpreted against the reference, and compiled
-	$(BIN)/python -m pip install --quiet "triton>=3.8; sys_platform == 'linux'"
+	$(BIN)/python -m pip install --quiet -c constraints.txt "triton>=3.8; sys_platform == 'linux'"
 	$(BIN)/python -m pytest tests/kernels/test_cuda_interpreted.py
 
 test-notebooks: env  ## every notebook at a small size, and the numbers it prints

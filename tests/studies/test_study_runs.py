@@ -231,6 +231,16 @@ def test_one_folder_holds_one_study(executor, request_of, tmp_path: Path) -> Non
         ablate(replace(request, study=str(tmp_path / "another.toml")), _yes)
 
 
+def test_a_published_report_is_not_replaced(executor, request_of) -> None:
+    """Its runs are elsewhere: the page and its figures are all there is."""
+    request = request_of()
+    Path(request.out).mkdir()
+    (Path(request.out) / "index.html").write_text("")
+    with pytest.raises(InputError, match="holds a published report, which this study would replace"):
+        ablate(request, _yes)
+    assert not executor.made and [path.name for path in Path(request.out).iterdir()] == ["index.html"]
+
+
 def test_the_forecast_adds_up() -> None:
     slow, fast = Cost(step=0.5, other=10.0, size=4 * 10**9), Cost(step=0.1, other=5.0, size=10**9)
     costs = [(slow, Budget.parse("1h")), (slow, Budget.parse("100steps")), (fast, Budget.parse("60s"))]

@@ -110,7 +110,9 @@ def _nerfstudio() -> dict[str, Run]:
     try:
         from nerfstudio.field_components.encodings import HashEncoding  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise MissingError(f"not installed ({error}); `pip install nerfstudio`") from None
+        raise MissingError(
+            f"not installed ({error}); `pip install nerfstudio` in an environment of its own: it pins an older viser"
+        ) from None
     encoding = HashEncoding(
         num_levels=HASH_GATE["levels"],
         min_res=BASE,

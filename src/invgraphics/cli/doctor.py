@@ -48,7 +48,7 @@ class Doctor:
             if finding.remedy:
                 print(f"{finding.subject}: {finding.remedy}")
         missing = [finding for finding in findings if finding.remedy]
-        print("Nothing is missing." if not missing else "Everything works without what is marked !, only slower or with less.")
+        print("Nothing is missing." if not missing else "What is marked ! is slower or not there; everything else works.")
         return 0
 
 
@@ -60,6 +60,8 @@ def examine(warm_up: bool) -> Iterator[Finding]:
     yield _llvm()
     yield from _cuda()
     yield _lpips()
+    yield _extra("viewer", "viser", "`invgraphics view`")
+    yield _extra("ray", "ray", "studies on a cluster")
     yield _data()
 
 
@@ -131,6 +133,13 @@ def _lpips() -> Finding:
     if importlib.util.find_spec("lpips") is None:
         return Finding("LPIPS", "not installed", "an extra: `pip install 'invgraphics[lpips]'`, and weights of your own")
     return Finding("LPIPS", "installed without weights", reason)
+
+
+def _extra(name: str, package: str, purpose: str) -> Finding:
+    """Finding about an extra of one package."""
+    if importlib.util.find_spec(package) is None:
+        return Finding(package, "not installed", f"for {purpose}: `pip install 'invgraphics[{name}]'`")
+    return Finding(package, f"{version(package)}, for {purpose}")
 
 
 def _data() -> Finding:

@@ -41,7 +41,8 @@ class Export:
         to: What to write: of Gaussians ply (3DGS's own, without loss), splat (32 bytes per Gaussian, no view dependence) or spz
             (smallest); of any model mesh, a surface with coloured vertices as GLB, PLY or OBJ; of planes and densities mpi, a
             zip archive of PNG layers and their JSON description.
-        out: The file to write; one that exists is replaced. A mesh has the format of its ending: .glb, .ply or .obj.
+        out: The file to write; one that exists is replaced. Its ending is the format's (.ply, .splat, .spz); a mesh is written
+            as its ending says: .glb, .ply or .obj.
         scene: Another copy of the scene, for instance where the data set has moved.
         world: Where the world's +x, +y, +z point, for formats that want certain axes (spz, glb: right, up, back): opencv is
             right, down, forward; opengl right, up, back; z-up right, forward, up. Built-in and Blender scenes are z-up.

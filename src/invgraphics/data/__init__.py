@@ -13,8 +13,8 @@ Kind = Literal["scenes", "renderers", "studies"]
 def find(kind: Kind, name: str = "") -> Path:
     """Path of the packaged ``kind`` folder, or of the entry ``name`` in it.
 
-    An installed wheel carries the folders beside this file; a checkout, whose editable install ignores the wheel's
-    ``force-include``, has them at the repository root.
+    An installed wheel carries the folders beside this file. A checkout has them at the repository's root; the copies that an
+    editable install makes are not read.
 
     Raises:
         InputError: there is no such entry; the ones there are, are listed.

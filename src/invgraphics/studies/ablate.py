@@ -26,7 +26,7 @@ from invgraphics.experiments.request import AblateRequest
 from invgraphics.interruption import INTERRUPTED
 from invgraphics.recipes.presets import announcements
 from invgraphics.runs.folder import RunFolder
-from invgraphics.runs.study import CellRecord
+from invgraphics.runs.study import CellRecord, StudyRecord
 from invgraphics.scenes.open import missing_data_reason
 from invgraphics.studies.analyses import write_analyses
 from invgraphics.studies.cells import Planned, make_plan, select
@@ -37,6 +37,8 @@ from invgraphics.studies.study import Study
 from invgraphics.text import duration
 from invgraphics.thread_pools import usable_cores
 
+PAGE = "index.html"
+"""Page of a report."""
 Size = int | tuple[int, int] | None
 """Longest side in pixels, or (width, height)."""
 Trials = dict[tuple[str, str, Size], tuple[Job, Scene]]
@@ -88,6 +90,8 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
     plan = make_plan(study, request)
     chosen = {planned.id for planned in select(plan, request)}
     folder = RunFolder(Path(request.out))
+    if (folder.root / PAGE).is_file() and not folder.has(StudyRecord):
+        raise InputError(f"{folder.root} holds a published report, which this study would replace.", "Choose another --out.")
     folder.create()
     with folder.held():
         record = StudyRecorder(folder, summarise_study(study, name_of(path), (request, resources), plan[0].job), plan)
