@@ -462,3 +462,12 @@ def test_patterns_name_what_nothing_else_does_in_the_order_given(tmp_path: Path)
     assert names[0].startswith(SPLATS.name) or names[0].startswith(str(tmp_path))
     assert names[-1] == "planes/mpi" and len(set(names)) == len(names)
     assert optional == set(names[1:-1]) and "planes/nex" in optional
+
+
+def test_refined_poses_are_scored_on_their_own_photographs_only() -> None:
+    scene = ig.testing.toy_scene(views=5, size=12)
+    method = ig.load_method("splatting/gaussians", set={"field.count": 30, "training.poses.optimise": True})
+    fit = ig.fit(method, scene, "2steps")
+    assert fit.poses is not None and ig.evaluate(fit, scene)["psnr"] > 0
+    with pytest.raises(InputError, match="has refined poses of other photographs"):
+        ig.evaluate(fit, scene.with_views(train=scene.train[1:]))

@@ -95,7 +95,7 @@ def test_compare_then_evaluate_and_report(tmp_path, capsys, request) -> None:
     assert capsys.readouterr().out.strip() == str(tmp_path / "page" / "index.html")
 
     assert main.run(["fit", "splatting/gaussians", str(data), "--out", str(cell)]) == main.BAD_INPUT
-    assert "--resume" in capsys.readouterr().err
+    assert "holds another run: its budget is 2 steps, not 60 s" in capsys.readouterr().err
 
 
 def test_folders_without_runs_are_told_apart(tmp_path) -> None:

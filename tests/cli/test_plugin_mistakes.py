@@ -40,6 +40,8 @@ class Fog(Field):
             density = density - 0.75
         if self.mistake == "whole":
             density = density.long()
+        if self.mistake == "missing":
+            radiance = None
         return FieldValues(density=density, radiance=radiance)
 
 class Silent(Fog):
@@ -165,6 +167,7 @@ def renderer(mistake: str) -> dict[str, Any]:
     [
         (field("tuple"), r"Fog.query returned tuple, no FieldValues"),
         (field("whole"), r"Fog.query returned density of type torch.int64, no floating-point numbers"),
+        (field("missing"), r"Fog.query returned no radiance, which it was asked for"),
         (field("negative"), r"128 of 128 densities of Fog are negative, down to -0.25"),
         (field("silent"), r"Silent declares no quantities as 'provides'"),
         ({"field": {"type": "mistaken_unbuilt"}}, r"'mistaken_unbuilt' of the fields, UnbuiltConfig, has no method 'build'"),

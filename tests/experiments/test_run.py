@@ -263,9 +263,18 @@ def test_existing_runs_are_not_overwritten(run: Path, toy_folder: Path) -> None:
         fit_run(_request(toy_folder, run, seed=5, existing="resume"))
     with pytest.raises(InputError, match="holds another run: its budget is 30 steps, not 31 steps"):
         fit_run(_request(toy_folder, run, budget="31steps", existing="resume"))
+    with pytest.raises(InputError, match="holds no run to resume"):
+        fit_run(_request(toy_folder, run.parent / "nothing", existing="resume"))
     stamp = (run / "scores.json").stat().st_mtime_ns
     fit_run(_request(toy_folder, run, existing="reuse"))
     assert (run / "scores.json").stat().st_mtime_ns == stamp
+
+
+def test_an_unfinished_run_says_how_it_goes_on(run: Path, toy_folder: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(run, tmp_path / "run")
+    (folder / "scores.json").unlink()
+    with pytest.raises(InputError, match=r"holds this fit, unfinished\.\nAdd --resume"):
+        fit_run(_request(toy_folder, folder))
 
 
 def test_a_renamed_method_is_named(run: Path, toy_folder: Path) -> None:

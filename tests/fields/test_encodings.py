@@ -109,5 +109,6 @@ def test_configs_survive_a_round_trip_and_refuse_nonsense():
         (HashConfig, {"base": 64, "finest": 32}),
         (HashConfig, {"levels": 0}),
     ):
-        with pytest.raises(InputError):
+        with pytest.raises(InputError) as caught:
             fill(schema, table)
+        assert "Unknown key" not in caught.value.sentence

@@ -215,8 +215,9 @@ def test_lattices_by_role(make_scene) -> None:
     ],
 )
 def test_nonsense_is_refused(bad: dict) -> None:
-    with pytest.raises(InputError):
+    with pytest.raises(InputError) as caught:
         fill(NeuralFieldConfig, bad)
+    assert "Unknown key" not in caught.value.sentence
 
 
 def test_heads_without_a_network_say_how_many_features_they_take(make_scene) -> None:

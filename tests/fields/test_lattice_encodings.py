@@ -200,7 +200,8 @@ def test_configs_survive_a_round_trip_and_refuse_nonsense() -> None:
         (CpConfig, {"components": 0}),
         (TriplaneConfig, {"resolution": 0}),
     ):
-        with pytest.raises(InputError):
+        with pytest.raises(InputError) as caught:
             fill(schema, table)
+        assert "Unknown key" not in caught.value.sentence
     with pytest.raises(InputError, match="at least 2"):
         encoding_of("vm").resize((1, 8, 8))

@@ -82,6 +82,18 @@ def test_upper_bands(tmp_path: Path, floats: int, degree: int) -> None:
         assert torch.allclose(sh[:, 1 + k, channel], torch.tensor(stored[i % 4]))
 
 
+def test_elements_of_too_few_rows_are_refused(tmp_path: Path) -> None:
+    _write(tmp_path / "a.ply", sh=9)
+    found = PlyData.read(tmp_path / "a.ply")
+    for name, words in (("chunk", "300 Gaussians and only 1 chunks of 256"), ("sh", "but the SH coefficients of 299")):
+        kept = [
+            PlyElement.describe(element.data[:-1] if element.name == name else element.data, element.name) for element in found
+        ]
+        PlyData(kept).write(tmp_path / "less.ply")
+        with pytest.raises(InputError, match=words):
+            read_gaussians(tmp_path / "less.ply")
+
+
 def test_it_is_not_written(tmp_path: Path) -> None:
     _write(tmp_path / "a.ply")
     with pytest.raises(InputError, match="can only be read"):

@@ -112,6 +112,7 @@ def test_only_a_lead_beyond_chance_is_bold(built_report: Path) -> None:
 def test_baselines_are_shown_and_never_best(built_report: Path) -> None:
     cells = Cells((built_report / "index.html").read_text()).cells
     table = json.loads((built_report / "compare.json").read_text())
+    assert set(table["baselines"]) == {"mean image", "nearest view"}
     for name, quality in table["baselines"].items():
         assert cells[(name, "psnr")][:2] == [quality["psnr"]["mean"], False]
 
@@ -336,8 +337,9 @@ def test_hostile_names_are_escaped_everywhere(comparison_folder: Path, edit: Cal
     assert "<script>alert" not in page
     assert html.escape(evil, quote=False) in page
     assert "<script>" not in (comparison_folder / "index.md").read_text()
-    for figure in (comparison_folder / "figures").glob("*.svg"):
-        assert "<script>" not in figure.read_text()
+    figures = list((comparison_folder / "figures").glob("*.svg"))
+    assert figures
+    assert all("<script>" not in figure.read_text() for figure in figures)
     latex = (comparison_folder / "table.tex").read_text()
     assert r"\textless{}script\textgreater{}" in latex
     assert r"\$x\_1\$" in latex

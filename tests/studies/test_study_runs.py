@@ -241,6 +241,14 @@ def test_a_published_report_is_not_replaced(executor, request_of) -> None:
     assert not executor.made and [path.name for path in Path(request.out).iterdir()] == ["index.html"]
 
 
+def test_a_study_that_the_disk_cannot_hold_is_not_started(executor, request_of, monkeypatch) -> None:
+    usage = shutil.disk_usage(".")
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda folder: usage._replace(free=10))
+    with pytest.raises(InputError, match="The study will write .* GB left"):
+        ablate(request_of(), _yes)
+    assert not executor.made
+
+
 def test_the_forecast_adds_up() -> None:
     slow, fast = Cost(step=0.5, other=10.0, size=4 * 10**9), Cost(step=0.1, other=5.0, size=10**9)
     costs = [(slow, Budget.parse("1h")), (slow, Budget.parse("100steps")), (fast, Budget.parse("60s"))]

@@ -1,5 +1,6 @@
 """Films and snapshots: paths through a scene, time-lapses of a fit, caps and starts that a command line asks for."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -246,10 +247,13 @@ def test_gaussians_start_from_another_run(toy_folder: Path, tmp_path: Path) -> N
     moved = fit_run(_request(toy_folder, tmp_path / "moved", **(first | {"overrides": (*first["overrides"], *refined)})))
     features = ("field.width=8", "field.features=8", "renderer.features=8", "renderer.width=8", "batches.rays=64")
     without = fit_run(_request(toy_folder, tmp_path / "srn", method="learned/srn", budget="1steps", overrides=features))
+    other_scene = shutil.copytree(toy_folder, tmp_path / "another-scene")
+    elsewhere = fit_run(_request(other_scene, tmp_path / "elsewhere", **first))
     wrongs = (
         (tmp_path / "none", "is not a run"),
         (without, "not density and radiance"),
         (moved, "has refined its cameras' poses"),
+        (elsewhere, "is a run on"),
     )
     for wrong, words in wrongs:
         items = (*SMALL[METHOD], "field.init=field", f"field.source={wrong}")

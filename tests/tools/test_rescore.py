@@ -89,6 +89,7 @@ def test_a_tools_convention_from_the_files_alone(run: Path) -> None:
     """3DGS's metrics.py on a run, from its arrays by hand."""
     got = scores_of(run, "3dgs-metrics").quality["psnr"].per_view
     truth_folder = run / json.loads((run / "provenance.json").read_text())["truth"]
+    assert len(got) == 3
     for index, value in enumerate(got):
         saved, truth = (np.load(folder / f"{index:04d}.npz") for folder in (run / "test", truth_folder))
         image = (saved["rgb"].astype(np.float64) * 255).clip(0, 255).round()

@@ -209,8 +209,13 @@ def test_contracted_space_is_not_cropped_but_refined():
 
 
 def test_bad_settings_and_fields_are_refused(scene):
-    for settings in ({"at": 0.0}, {"at": 0.5, "threshold": 0.0}, {"at": 0.5, "scale": 0.9}, {"at": 0.5, "moments": "keep"}):
-        with pytest.raises(ValueError, match=r"at|scale|kept"):
+    for settings, words in (
+        ({"at": 0.0}, "'at' and 'threshold' lie between 0 and 1"),
+        ({"at": 0.5, "threshold": 0.0}, "'at' and 'threshold' lie between 0 and 1"),
+        ({"at": 0.5, "scale": 0.9}, "'scale' is at least 1"),
+        ({"at": 0.5, "moments": "keep"}, "cannot be kept"),
+    ):
+        with pytest.raises(ValueError, match=words):
             TightBoxConfig(**settings)
     vm = ["field.encoding.type=vm", "field.encoding.resolution=8"]
     with pytest.raises(InputError, match="needs dense voxel grids"):

@@ -208,8 +208,13 @@ def test_methods_learn_the_toy_scene(name, settings, scene):
 
 
 def test_bad_settings_are_refused(scene):
-    for settings in ({"at": ()}, {"at": (0.5, 0.2)}, {"at": (0.5,), "weight": -1.0}, {"at": (0.5,), "rays": 0}):
-        with pytest.raises(ValueError, match=r"at|weight"):
+    for settings, words in (
+        ({"at": ()}, "'at' needs"),
+        ({"at": (0.5, 0.2)}, "'at' needs"),
+        ({"at": (0.5,), "weight": -1.0}, "'weight' and 'dilation' must not be negative"),
+        ({"at": (0.5,), "rays": 0}, "'rays' must be at least 1"),
+    ):
+        with pytest.raises(ValueError, match=words):
             PruneConfig(**settings)
     with pytest.raises(ValueError, match="resolution"):
         SparseVoxelsConfig(resolution=1)

@@ -254,21 +254,21 @@ def test_warming_up_leaves_the_fit_as_it_was(scene):
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("settings", "words"),
     [
-        {"at": ()},
-        {"at": (0.5, 0.2), "resolution": 9},
-        {"at": (0.0,), "resolution": 9},
-        {"at": (1.0,), "resolution": 9},
-        {"at": (0.5,)},
-        {"at": (0.5,), "resolution": 9, "resolutions": (9,)},
-        {"at": (0.2, 0.5), "resolutions": (9,)},
-        {"at": (0.2,), "resolution": 1},
-        {"at": (0.2,), "resolution": 9, "min_spacing": -1.0},
+        ({"at": ()}, "'at' needs"),
+        ({"at": (0.5, 0.2), "resolution": 9}, "'at' needs"),
+        ({"at": (0.0,), "resolution": 9}, "'at' needs"),
+        ({"at": (1.0,), "resolution": 9}, "'at' needs"),
+        ({"at": (0.5,)}, "either 'resolution' or 'resolutions' must be given"),
+        ({"at": (0.5,), "resolution": 9, "resolutions": (9,)}, "either 'resolution' or 'resolutions' must be given"),
+        ({"at": (0.2, 0.5), "resolutions": (9,)}, "one entry for each of the 2 in 'at'"),
+        ({"at": (0.2,), "resolution": 1}, "at least 2 vertices"),
+        ({"at": (0.2,), "resolution": 9, "min_spacing": -1.0}, "'min_spacing' is a number of pixels"),
     ],
 )
-def test_bad_schedules_are_refused(settings):
-    with pytest.raises(ValueError, match=r"at|resolution|min_spacing"):
+def test_bad_schedules_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words):
         UpsampleConfig(**settings)
 
 
