@@ -54,12 +54,11 @@ MIXED: dict[str, tuple[Callable[..., Tensor], list[Tensor]]] = {
 }
 
 
-REFUSED = {
-    ("rasterise", torch.float64),
-    ("rasterise", torch.float16),
-    ("segments", torch.float64),
-    ("density", torch.float64),
-    ("composite", torch.float16),
+REFUSED_DTYPES = {
+    "rasterise": (torch.float64, torch.float16),
+    "segments": (torch.float64,),
+    "density": (torch.float64,),
+    "composite": (torch.float16,),
 }
 """Mixtures of which torch itself complains in the reference."""
 
@@ -71,7 +70,7 @@ def test_a_second_operand_of_another_dtype_changes_no_result(name: str, dtype: t
     function, (first, second) = MIXED[name]
     second = second.to(dtype).float()  # the same numbers, as far as the dtype holds them
     expected = function(first, second)
-    if (name, dtype) in REFUSED:
+    if dtype in REFUSED_DTYPES.get(name, ()):
         with pytest.raises(RuntimeError, match=r"dtype|scalar type|Float|Double|Half"):
             function(first, second.to(dtype))
         return

@@ -244,7 +244,7 @@ def test_a_published_report_is_not_replaced(executor, request_of) -> None:
 def test_a_study_that_the_disk_cannot_hold_is_not_started(executor, request_of, monkeypatch) -> None:
     usage = shutil.disk_usage(".")
     monkeypatch.setattr(module.shutil, "disk_usage", lambda folder: usage._replace(free=10))
-    with pytest.raises(InputError, match="The study will write .* GB left"):
+    with pytest.raises(InputError, match=r"The study will write .* GB left"):
         ablate(request_of(), _yes)
     assert not executor.made
 
