@@ -59,9 +59,11 @@ def test_make_targets_exist() -> None:
 
 
 def test_linked_files_exist() -> None:
-    for page in ("README.md", "CONTRIBUTING.md"):
-        for link in re.findall(r"\]\((?!http)([^)#]+)\)", (ROOT / page).read_text()):
-            assert (ROOT / link).exists(), f"{page} links {link}"
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("*/README.md")]
+    assert len(pages) > 10
+    for page in pages:
+        for link in re.findall(r"\]\((?!http)([^)#]+)(?:#[^)]*)?\)", page.read_text()):
+            assert (page.parent / link).exists(), f"{page} links {link}"
 
 
 def test_nothing_names_this_workplace() -> None:

@@ -77,6 +77,20 @@ def test_lists_of_a_kind_tell_what_its_members_mean(capsys: pytest.CaptureFixtur
     assert "'bricks'. It is a scene: `invgraphics list scenes`." in _said(["list", "bricks"], capsys)
 
 
+def test_commas_are_no_remedy_where_there_is_one_method(capsys: pytest.CaptureFixture[str]) -> None:
+    said = _said(["fit", "volumetric/hash", "bricks", "splatting/gaussians"], capsys)
+    assert "Unrecognized options: splatting/gaussians" in said and "--methods" not in said
+
+
+def test_a_comparison_does_not_replace_a_published_report(
+    toy_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "index.html").write_text("")
+    words = ["compare", str(toy_folder), "--methods", "splatting/gaussians", "--budget", "1steps", "--out", str(tmp_path)]
+    assert "holds a published report, which would be replaced.\nChoose another --out." in _said(words, capsys)
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["index.html"]
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

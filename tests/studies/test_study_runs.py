@@ -236,7 +236,7 @@ def test_a_published_report_is_not_replaced(executor, request_of) -> None:
     request = request_of()
     Path(request.out).mkdir()
     (Path(request.out) / "index.html").write_text("")
-    with pytest.raises(InputError, match="holds a published report, which this study would replace"):
+    with pytest.raises(InputError, match="holds a published report, which would be replaced"):
         ablate(request, _yes)
     assert not executor.made and [path.name for path in Path(request.out).iterdir()] == ["index.html"]
 

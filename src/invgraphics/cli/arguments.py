@@ -172,7 +172,7 @@ def condense(box: str) -> tuple[str, str]:
         r"no type matching .* could be instantiated from \['(.*?)'\]\. Got errors: .*<class '(\w+)'>.*", _misfit, sentence
     )
     hints = [part for part in parts[1:-1] if part.startswith("Perhaps")]
-    if re.fullmatch(r"Unrecognized options: [^-]\S*/.*", sentence):
+    if re.fullmatch(r"Unrecognized options: [^-]\S*/.*", sentence) and "invgraphics compare" in parts[-1]:
         hints = ["Names of several methods have commas between them: --methods A,B."]
     return "\n".join([sentence, *hints[:1]]), parts[-1] if len(parts) > 1 else ""
 

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from invgraphics import plugins
 from invgraphics.cli.output import show_table
-from invgraphics.data import find
+from invgraphics.data import find, has_scene
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.tables import read_toml
 
@@ -95,7 +95,7 @@ def _method(name: str) -> Method:
     recipe = split_name(name)[0]
     if "/" not in recipe and not recipe.endswith(".toml") and recipe not in methods():
         guess = did_you_mean(name, KINDS) or suggested_method(recipe, methods())
-        if (find("scenes") / name / "scene.toml").is_file():
+        if has_scene(name):
             guess = " It is a scene: `invgraphics list scenes`."
         raise InputError(f"There is no list of '{name}'.{guess}", f"Lists: {', '.join(KINDS)}; or a method.")
     return load_method(name)

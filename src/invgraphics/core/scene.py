@@ -73,8 +73,9 @@ class View:
 
     def valid(self) -> Bool[Tensor, "h w"]:
         """Which pixels count: the mask, or True everywhere."""
-        everywhere = torch.ones(self.image.shape[:2], dtype=torch.bool, device=self.image.device)
-        return everywhere if self.mask is None else self.mask
+        if self.mask is not None:
+            return self.mask
+        return torch.ones(self.image.shape[:2], dtype=torch.bool, device=self.image.device)
 
     def over(self, background: Float[Tensor, 3], index: Tensor | None = None) -> Float[Tensor, "*p 3"]:
         """The photograph in front of ``background``."""

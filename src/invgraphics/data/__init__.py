@@ -30,6 +30,16 @@ def find(kind: Kind, name: str = "") -> Path:
     return folder / name
 
 
+def has_scene(name: str) -> bool:
+    """Whether a scene of this name is built in."""
+    return (find("scenes") / name / "scene.toml").is_file()
+
+
+def has_method(name: str) -> bool:
+    """Whether a method of this name, ``renderer/recipe``, is built in."""
+    return (find("renderers") / f"{name}.toml").is_file()
+
+
 def _roots() -> tuple[Path, ...]:
     here = Path(__file__).resolve()
     return here.parent, here.parents[3]

@@ -14,8 +14,10 @@ from invgraphics.experiments.job import Job
 from invgraphics.experiments.progress import warn
 from invgraphics.experiments.renderings import is_kept, is_kept_fit, renderings_complete
 from invgraphics.experiments.request import CompareRequest, FitRequest
+from invgraphics.runs.comparison import ComparisonRecord
 from invgraphics.runs.folder import RUNS, RunFolder
 from invgraphics.runs.provenance import Provenance
+from invgraphics.runs.schema import Record
 
 
 def name_others(request: CompareRequest) -> None:
@@ -26,12 +28,23 @@ def name_others(request: CompareRequest) -> None:
         warn(f"Not part of this report, but of an earlier command on {request.out}: {', '.join(left)}.")
 
 
-def check_folders(request: CompareRequest) -> None:
-    """Refuse methods of other names whose runs would share a folder: a built-in method, and a file of that name.
+def check_not_published(folder: RunFolder, record: type[Record]) -> None:
+    """Refuse a folder that holds a report's page without the record of its runs: a published one, which would be replaced.
 
     Raises:
-        InputError: names two of them.
+        InputError: it is one.
     """
+    if (folder.root / "index.html").is_file() and not folder.has(record):
+        raise InputError(f"{folder.root} holds a published report, which would be replaced.", "Choose another --out.")
+
+
+def check_folders(request: CompareRequest) -> None:
+    """Refuse a published report's folder, and methods of other names whose runs would share one: built in, and a file.
+
+    Raises:
+        InputError: names the folder, or two methods.
+    """
+    check_not_published(RunFolder(Path(request.out)), ComparisonRecord)
     owners: dict[Path, str] = {}
     for method in request.methods:
         folder = request.folder(method, request.seeds[0]).parent

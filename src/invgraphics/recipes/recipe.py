@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from invgraphics import plugins
 from invgraphics.config import fill, merge, set_path, to_table
-from invgraphics.data import find
+from invgraphics.data import find, has_method, has_scene
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.recipes.aliases import suggested_method
 from invgraphics.recipes.presets import select_preset
@@ -238,7 +238,7 @@ def source(name: str) -> dict[str, Any]:
         if not path.is_file():
             known = methods()
             guess = suggested_method(name, known)
-            if (find("scenes") / name / "scene.toml").is_file():
+            if has_scene(name):
                 guess = f" '{name}' is a scene; the order is `fit METHOD SCENE`."
             sentence = f"There is no method '{name}'.{guess}"
             others = "Those of other packages are known once the package is installed."
@@ -248,7 +248,7 @@ def source(name: str) -> dict[str, Any]:
 
 def is_built_in(name: str) -> bool:
     """Whether a method of `methods` is one of ours; a third-party recipe cannot take its name."""
-    return (find("renderers") / f"{name}.toml").is_file()
+    return has_method(name)
 
 
 def _foreign_source(name: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 from invgraphics import plugins
 from invgraphics.core import Scene
-from invgraphics.data import find
+from invgraphics.data import has_method
 from invgraphics.errors import InputError, did_you_mean
 from invgraphics.scenes.layout import SceneOptions, evenly
 from invgraphics.scenes.pictures.images import image_files
@@ -115,7 +115,7 @@ def _load(spec: str, options: SceneOptions, progress: Callable[[int, int, str], 
 
 def _guess(spec: str) -> str:
     """What a name that is no scene's may mean, as a sentence after a space; empty where nothing is like it."""
-    if (find("renderers") / f"{spec}.toml").is_file():
+    if has_method(spec):
         return f" '{spec}' is a method; the order is `fit METHOD SCENE`, `compare SCENE --methods A,B`."
     if os.environ.get(DATA) and len(spec) > 2 and "/" not in spec:
         captures = sorted(path.name for path in Path(os.environ[DATA]).glob(f"*{glob.escape(spec)}*"))

@@ -63,7 +63,7 @@ def without_blank_views(scene: Scene) -> Scene:
     kept, blank = {}, []
     for split, what in (("train", "training"), ("val", ""), ("test", "test")):
         views = getattr(scene, split)
-        valid = [bool(view.valid().any()) for view in views]
+        valid = [view.mask is None or bool(view.mask.any()) for view in views]
         kept[split] = tuple(itertools.compress(views, valid))
         blank += [view.name for view, one in zip(views, valid, strict=True) if not one]
         if what and not kept[split]:

@@ -16,7 +16,7 @@ from invgraphics import plugins
 from invgraphics.core import Scene
 from invgraphics.errors import InputError
 from invgraphics.experiments.build import open_with_progress
-from invgraphics.experiments.compare_folders import warn_of_replaced
+from invgraphics.experiments.compare_folders import check_not_published, warn_of_replaced
 from invgraphics.experiments.executors.base import Executor, Outcome, Resources
 from invgraphics.experiments.identity import check_replaceable, run_digest, truth_digest
 from invgraphics.experiments.job import Job
@@ -37,8 +37,6 @@ from invgraphics.studies.study import Study
 from invgraphics.text import duration
 from invgraphics.thread_pools import usable_cores
 
-PAGE = "index.html"
-"""Page of a report."""
 Size = int | tuple[int, int] | None
 """Longest side in pixels, or (width, height)."""
 Trials = dict[tuple[str, str, Size], tuple[Job, Scene]]
@@ -90,8 +88,7 @@ def ablate(request: AblateRequest, confirm: Callable[[Forecast], None]) -> tuple
     plan = make_plan(study, request)
     chosen = {planned.id for planned in select(plan, request)}
     folder = RunFolder(Path(request.out))
-    if (folder.root / PAGE).is_file() and not folder.has(StudyRecord):
-        raise InputError(f"{folder.root} holds a published report, which this study would replace.", "Choose another --out.")
+    check_not_published(folder, StudyRecord)
     folder.create()
     with folder.held():
         record = StudyRecorder(folder, summarise_study(study, name_of(path), (request, resources), plan[0].job), plan)

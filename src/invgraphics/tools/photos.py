@@ -78,10 +78,10 @@ def compare(folder: Path, quality: dict[str, Any], truth: Path) -> dict[str, Any
     known = true_cameras(find_loader(truth).load(truth, SceneOptions(size=_SMALL, test_views=None)))
     estimated, true = [], []
     for camera in quality["cameras"]:
-        truly = _lookup(known, folder, camera["source"])
-        if truly is not None and camera.get("orientation", 1) in STORED_AXES:
-            estimated.append(_pose_of_stored(camera, truly))
-            true.append(truly.cam_to_world)
+        true_camera = _lookup(known, folder, camera["source"])
+        if true_camera is not None and camera.get("orientation", 1) in STORED_AXES:
+            estimated.append(_pose_of_stored(camera, true_camera))
+            true.append(true_camera.cam_to_world)
     if len(true) < _LEAST:
         raise InputError(
             f"{truth} has poses of {len(true)} of the {len(quality['cameras'])} placed photographs of {folder}.",
@@ -91,7 +91,7 @@ def compare(folder: Path, quality: dict[str, Any], truth: Path) -> dict[str, Any
     return {"source": str(truth), **errors.summary()}
 
 
-def _pose_of_stored(camera: Mapping[str, Any], truly: Camera) -> Float[Tensor, "4 4"]:
+def _pose_of_stored(camera: Mapping[str, Any], true_camera: Camera) -> Float[Tensor, "4 4"]:
     """Recovered pose of a photograph in the orientation that the data set's camera has.
 
     Its pictures count as stored, unless their shape is that of the upright one alone.
@@ -99,7 +99,7 @@ def _pose_of_stored(camera: Mapping[str, Any], truly: Camera) -> Float[Tensor, "
     pose, orientation = torch.tensor(camera["cam_to_world"], dtype=torch.float64), camera.get("orientation", 1)
     width, height = camera.get("size", (0, 0))
     quarter_turn = STORED_AXES[orientation][0] in "UD"
-    is_upright = quarter_turn and (width - height) * (truly.width - truly.height) > 0
+    is_upright = quarter_turn and (width - height) * (true_camera.width - true_camera.height) > 0
     return pose if is_upright else upright_to_stored(pose, orientation)
 
 
